@@ -3,8 +3,13 @@
 import json
 import math
 import re
+import tomllib
+from contextlib import suppress
+from copy import deepcopy
 from dataclasses import replace
 from datetime import date
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,6 +18,7 @@ import pytest
 from scipy.stats import chi2, multivariate_normal, multivariate_t
 
 import imulab as il
+import imulab.certificate.laboratory as laboratory_file
 from imulab.certificate.dcc import dcc_xml
 from imulab.certificate.laboratory import TEMPLATE, day_remarks, load_laboratory
 from imulab.certificate.model import make_certificate
@@ -363,19 +369,32 @@ def test_parameters_without_uncertainty_are_counted(issue):
 
 REFUSED = {
     "nobody signs": (LAB.replace("signs = true", "signs = false"), "persons: nobody signs"),
-    "unknown key": (LAB.replace("role =", "rank ="), "persons[0]: unknown key 'rank'"),
-    "missing": (LAB.replace('condition = "as received"', ""), "item: expected condition, which is missing"),
+    "unknown key": (LAB.replace("role =", "rank ="), "persons 1: unknown key 'rank'; known keys: name role signs"),
+    "missing": (LAB.replace('condition = "as received"', ""), "item: no condition; expected a text"),
     "empty": (LAB.replace('"as received"', '""'), "item.condition: expected a text that is not empty"),
     "space": (LAB.replace('"as received"', '" as received"'), "item.condition: expected a text that is not empty"),
     "bell": (LAB.replace("as received", r"as\u0007received"), "item.condition: a control or bidirectional character"),
+    "word": (
+        LAB.replace('"laboratory"', '"lab"'),
+        "certificate.location: expected customer or customerBranch or laboratory or laboratoryBranch or other, "
+        "found 'lab'",
+    ),
+    "day": (
+        LAB.replace("issued = ", "issued = 1 # "),
+        "certificate.issued: expected a day such as 2026-11-24, found 1",
+    ),
+    "one day": (
+        LAB.replace("[2026-11-24, 2026-11-24]", "2026-11-24"),
+        "performed: expected the first and the last day, such as [2026-11-24, 2026-11-25], found 2026-11-24",
+    ),
     "country": (LAB.replace('"DE" }\n[customer]', '"Germany" }\n[customer]'), "laboratory.address.country: expected"),
     "no day": (LAB.replace("2026-11-20", '"last week"'), "certificate.received: "),
     "issued before": (LAB.replace("issued = 2026-11-27", "issued = 2026-11-23"), "out of order"),
     "received after": (LAB.replace("received = 2026-11-20", "received = 2026-11-25"), "received 2026-11-25, after"),
-    "infinite": (LAB.replace("23.0", "inf"), "conditions[0].value: "),
+    "infinite": (LAB.replace("23.0", "inf"), "conditions 1: value: expected a number, found inf"),
     "long unit": (
         LAB.replace('"degC"', f'"{"(" * 3000}m{")" * 3000}"'),
-        "conditions[0].unit: expected a text of length",
+        "conditions 1: unit: expected a unit of at most 64 characters",
     ),
     "own number": (
         LAB.replace("location =", 'replaces = "EX-2026-0042"\nreason = "typing"\nlocation ='),
@@ -407,6 +426,38 @@ def test_what_is_wrong_is_refused_in_one_line_and_nothing_is_written(issue, caps
     assert expected in message
     assert message.count("\n") == 1
     assert not Path("cert.xml").exists()
+
+
+def _places(table, place=()):
+    """The keys and indices of every entry in a table."""
+    for key, entry in table.items() if isinstance(table, dict) else enumerate(table):
+        yield (*place, key)
+        if isinstance(entry, dict | list):
+            yield from _places(entry, (*place, key))
+
+
+@pytest.mark.parametrize("wrong", ["removed", {"a": 1}, [[]], True, -1, math.nan, "1\t2 "], ids=repr)
+def test_every_mistake_is_refused_in_imulabs_words(monkeypatch, tmp_path, wrong):
+    """The place, counted from 1, what is expected, and what is found; nothing of the parser's."""
+    path = tmp_path / "lab.toml"
+    path.touch()
+    template = tomllib.loads(TEMPLATE)
+    for *outer, last in _places(template):
+        table = deepcopy(template)
+        inner = reduce(getitem, outer, table)
+        if wrong == "removed":
+            del inner[last]
+        else:
+            inner[last] = wrong
+        monkeypatch.setattr(laboratory_file, "load_toml", lambda *_, table=table: table)
+        with suppress(il.ImulabError):
+            load_laboratory(str(path))
+            continue  # a text may stand where another did
+        with pytest.raises(il.ImulabError) as refusal:
+            load_laboratory(str(path))
+        message = str(refusal.value)
+        assert re.match(rf"{path}: .*(expected |unknown key |nobody signs|out of order|a control)", message)
+        assert not re.search(r"`|\[\d\]|array|object|enum", message)
 
 
 @pytest.mark.parametrize(

@@ -156,7 +156,7 @@ def test_verbose_says_which_one_was_used(work, capsys):
             "gravty = 9.81\n",
             "unknown key 'gravty'; known keys: gravity latitude height layout limits limit; did you mean 'gravity'?",
         ),
-        ("gravity = \n", "the project file is not TOML: Invalid value (at line 1, column 11)"),
+        ("gravity = \n", "the project file is not TOML: Invalid value (at line 1, column 11): 'gravity ='"),
         ("gravity = true\n", "gravity = True: expected a text or a number, as --gravity takes it"),
         ("layout = 3\n", "layout = 3: expected the name of a file"),
         ('layout = "none.toml"\n', "layout = 'none.toml': no such file beside it"),

@@ -23,8 +23,8 @@ def listed(known: Iterable[str], word: object) -> str:
 
 
 def quoted(value: object, longest: int = 60) -> str:
-    """Return a value for a message, as Python writes it, cut if it is long."""
-    text = repr(value)
+    """Return a value for a message, as Python writes it (a day as TOML does), cut if it is long."""
+    text = str(value) if hasattr(value, "isoformat") else repr(value)
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 

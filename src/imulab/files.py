@@ -228,7 +228,9 @@ def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ReadError(f"{name}: the {what} file is not TOML: {error}") from None
+        at = re.search(r"line (\d+)", str(error))
+        found = f": {quoted(text.splitlines()[int(at[1]) - 1].strip())}" if at else ""
+        raise ReadError(f"{name}: the {what} file is not TOML: {error}{found}") from None
     except ValueError:  # Python reads no whole numbers of thousands of digits
         raise wide from None
     except RecursionError:

@@ -8,26 +8,35 @@ from __future__ import annotations
 import os
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import date, timedelta
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, inspect
 
 from imulab.certificate.units import dsi_unit
 from imulab.display import first_hidden
-from imulab.errors import ReadError, UnitError, first_of, listed
+from imulab.errors import ReadError, UnitError, first_of, listed, quoted
 from imulab.files import load_toml, unit_of
 from imulab.fleet.limits import Rule
 from imulab.quantities import LARGEST
 
-Text = Annotated[str, Meta(pattern=r"^\S+(\s+\S+)*$")]
-"""A text that the schema of certificates takes: not empty, without spaces at its ends."""
-Unit = Annotated[Text, Meta(max_length=64)]
-Size = Annotated[float, Meta(gt=0, le=LARGEST)]
-Country = Annotated[str, Meta(pattern="^[A-Z]{2}$")]
+
+def _as(text: str, **limits: Any) -> Meta:
+    """Return limits of a value, and what messages expect of it."""
+    return Meta(description=text, **limits)
+
+
+Text = Annotated[str, _as("a text that is not empty and has no space at its ends", pattern=r"^\S+(\s+\S+)*$")]
+"""A text that the schema of certificates takes."""
+Texts = Annotated[list[Text], _as('a list of texts such as ["IEEE Std 1293-2018"]')]
+Day = Annotated[date, _as("a day such as 2026-11-24")]
+Unit = Annotated[Text, _as("a unit of at most 64 characters, without a space at its ends", max_length=64)]
+Number = Annotated[float, _as("a number", ge=-LARGEST, le=LARGEST)]
+Size = Annotated[float, _as("a number above 0", gt=0, le=LARGEST)]
+Country = Annotated[str, _as("two capital letters such as DE", pattern="^[A-Z]{2}$")]
 Language = Literal["en", "de"]
 Location = Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"]
 
@@ -62,13 +71,13 @@ class Person(_Table, frozen=True, kw_only=True):
 
     name: Text
     role: Text
-    signs: bool = False
+    signs: Annotated[bool, _as("true or false")] = False
 
 
 class Recalibration(_Table, frozen=True, kw_only=True):
     """The day of the next calibration, which is stated only where the customer agreed to it (7.8.4.3)."""
 
-    date: date
+    date: Day
     agreed: Text
 
 
@@ -76,11 +85,11 @@ class Identity(_Table, frozen=True, kw_only=True):
     """The table ``certificate``: number, dates and place."""
 
     number: Text
-    issued: date
-    performed: tuple[date, date]
+    issued: Day
+    performed: Annotated[tuple[Day, Day], _as("the first and the last day, such as [2026-11-24, 2026-11-25]")]
     location: Location
     language: Language = "en"
-    received: date | None = None
+    received: Day | None = None
     reviewed: Text | None = None
     replaces: Text | None = None
     reason: Text | None = None
@@ -102,7 +111,7 @@ class Method(_Table, frozen=True, kw_only=True):
 
     name: Text
     procedure: Text
-    standards: list[Text] = []
+    standards: Texts = []
     deviations: Text
 
 
@@ -133,10 +142,10 @@ class Condition(_Table, frozen=True, kw_only=True):
     """A condition of the environment, with its expanded uncertainty."""
 
     name: Text
-    value: Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+    value: Number
     unit: Unit
     expanded_uncertainty: Size
-    coverage_factor: Annotated[float, Meta(ge=1, le=LARGEST)] = 2.0
+    coverage_factor: Annotated[float, _as("a number of 1 or more", ge=1, le=LARGEST)] = 2.0
 
 
 class Conformity(_Table, frozen=True, kw_only=True):
@@ -216,25 +225,14 @@ expanded_uncertainty = 0.5
 """
 """A LAB.toml to start from."""
 _NAMES_SOMEBODY = (
-    *("certificate.number", "laboratory.name", "customer.name", "persons.0.name", "item.manufacturer"),
-    *("equipment.0.certificate", "equipment.0.issuer"),
+    *("certificate.number", "laboratory.name", "customer.name", "persons[0].name", "item.manufacturer"),
+    *("equipment[0].certificate", "equipment[0].issuer"),
 )
 _OF_TUMBLE = ("item.name", "method.name")
 _LARGEST_LOGO = 2_000_000
-_UNKNOWN = re.compile("^Object contains unknown field `(.*)`$")
-_ENUM = re.compile("^Invalid enum value '(.*)'$")
-_CHOICES = {
-    "conformity.rule": get_args(Rule),
-    "location": get_args(Location),
-    "language": get_args(Language),
-    "quantity": ("gravity",),
-}
-_KINDS = {
-    "`float` <=": "a number of at most", "`float` >=": "a number of at least", "`float` >": "a number above",
-    "`float`": "a number", "`str` of length": "a text of length", "`str`": "a text", "`bool`": "true or false",
-    "`date`": "a day", "`array`": "a list", "`object`": "a table", "got": "found",
-}  # fmt: skip
-_MISSING = re.compile("^Object missing required field `(.*)`$")
+_KEY = re.compile(r"(unknown|missing required) field `(.*)`$")
+_WORD = re.compile(r"[^.\[\]]+")
+_INDEX = re.compile(r"\[(\d+)\]\.?")
 
 
 def load_laboratory(path: str) -> Laboratory:
@@ -253,11 +251,11 @@ def load_laboratory(path: str) -> Laboratory:
         raise ReadError(f"{path}: no such laboratory file; imulab certificate --template -o LAB.toml writes one")
     table = load_toml(path, path, "laboratory")
     if hidden := first_hidden(table):
-        raise ReadError(f"{path}: {hidden}: a control or bidirectional character; expected text alone")
+        raise ReadError(f"{path}: {counted(hidden)}: a control or bidirectional character; expected text alone")
     try:
         lab = msgspec.convert(table, Laboratory)
     except msgspec.ValidationError as error:
-        raise ReadError(f"{path}: {_reason(str(error))}") from None
+        raise ReadError(f"{path}: {_reason(str(error), table)}") from None
     if lab.laboratory.logo is not None:
         lab = msgspec.structs.replace(lab, laboratory=_with_logo(lab.laboratory, path))
     identity = lab.certificate
@@ -309,7 +307,9 @@ def template_remarks(path: str, parameters: Iterable[str] = (), *, tumbled: bool
 
     def unchanged(places: Iterable[str]) -> list[str]:
         values = ((place, _value(lab, place)) for place in places)
-        return [f"{place} = {value!r}" for place, value in values if value and value == _value(template, place)]
+        return [
+            f"{counted(place)} = {value!r}" for place, value in values if value and value == _value(template, place)
+        ]
 
     remarks = []
     if same := unchanged(_NAMES_SOMEBODY):
@@ -323,11 +323,16 @@ def template_remarks(path: str, parameters: Iterable[str] = (), *, tumbled: bool
     return remarks
 
 
+def counted(place: str) -> str:
+    """Return a place such as ``persons[0].name`` as a person counts: ``persons 1: name``."""
+    return _INDEX.sub(lambda index: f" {int(index[1]) + 1}: ", place).rstrip(": ")
+
+
 def _value(table: Any, place: str) -> Any:
-    """Return the value at a place such as ``persons.0.name``, None where there is none."""
-    for key in place.split("."):
+    """Return the value at a place such as ``persons[0].name``, None where there is none."""
+    for key in _WORD.findall(place):
         try:
-            table = table[int(key) if key.isdecimal() else key]
+            table = table[int(key) if isinstance(table, list) else key]
         except (KeyError, IndexError, TypeError):
             return None
     return table
@@ -345,19 +350,46 @@ def _with_logo(laboratory: Party, path: str) -> Party:
     return msgspec.structs.replace(laboratory, logo=str(logo))
 
 
-def _reason(message: str) -> str:
-    """Return the place of a mistake and what it is, from a message of msgspec's."""
+def _reason(message: str, table: Mapping[str, Any]) -> str:
+    """Return the place of a mistake, what is expected there and what is found, from a message of msgspec's."""
     what, _, where = message.partition(" - at `$")
-    place = where.rstrip("`").lstrip(".") or "the file"
-    if unknown := _UNKNOWN.match(what):
-        return f"{place}: unknown key {unknown[1]!r}"
-    if missing := _MISSING.match(what):
-        return f"{place}: expected {missing[1]}, which is missing"
-    if unlike := _ENUM.match(what):
-        known = next((each for key, each in _CHOICES.items() if place.endswith(key)), ())
-        return f"{place}: unknown {unlike[1]!r}; known: {listed(known, unlike[1])}"
-    if "matching regex" in what:
-        return f"{place}: expected a text that is not empty and has no space at its ends (a country: DE, two letters)"
-    for name, words in _KINDS.items():
-        what = what.replace(name, words)
-    return f"{place}: {what[0].lower()}{what[1:]}"
+    where = where.rstrip("`").lstrip(".")
+    kind, place = _kind_at(where), f"{counted(where)}: " if where else ""
+    if key := _KEY.search(what):
+        known = {field.name: field.type for field in _plain(kind).fields}
+        if key[1] == "unknown":
+            return f"{place}unknown key {quoted(key[2])}; known keys: {listed(known, key[2])}"
+        return f"{place}no {key[2]}; expected {_expected(known[key[2]], key[2])}"
+    return f"{place}expected {_expected(kind, where)}, found {quoted(_value(table, where))}"
+
+
+def _kind_at(where: str) -> Any:
+    """Return the type of a place, as msgspec describes types."""
+    kind: Any = inspect.type_info(Laboratory)
+    for key in _WORD.findall(where):
+        kind = _plain(kind)
+        if isinstance(kind, inspect.StructType):
+            kind = next(field.type for field in kind.fields if field.name == key)
+        else:
+            kind = kind.item_types[0] if isinstance(kind, inspect.TupleType) else kind.item_type
+    return kind
+
+
+def _plain(kind: Any) -> Any:
+    """Return a type without None and without what messages say of it."""
+    if isinstance(kind, inspect.UnionType):
+        kind = next(each for each in kind.types if not isinstance(each, inspect.NoneType))
+    return kind.type if isinstance(kind, inspect.Metadata) else kind
+
+
+def _expected(kind: Any, name: str) -> str:
+    """Return a type in words; `name` is that of its key."""
+    if isinstance(kind, inspect.UnionType):
+        kind = next(each for each in kind.types if not isinstance(each, inspect.NoneType))
+    if isinstance(kind, inspect.Metadata):
+        return str((kind.extra_json_schema or {})["description"])
+    if isinstance(kind, inspect.LiteralType):
+        return " or ".join(map(str, kind.values))
+    if isinstance(kind, inspect.StructType):
+        return f"a table with {', '.join(field.name for field in kind.fields if field.required)}"
+    return f"tables [[{name}]], one or more"
