@@ -1,5 +1,6 @@
 """Certificates as PDFs: what is printed, that the XML is inside, for archives and screen readers, refusals by name."""
 
+import shutil
 import sys
 from dataclasses import replace
 from decimal import Decimal
@@ -109,7 +110,9 @@ def test_a_letter_that_no_font_has_is_named(printed, capsys, where):
     lab = REVIEWED.replace(f'[{where}]\nname = "Example', f'[{where}]\nname = "漢字 Example')
     assert printed(lab) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"imulab: {where}.name: no font of the PDF has the letter '漢' (U+6F22); expected --fonts")
+    assert error.startswith(
+        f"imulab: lab.toml: {where}.name: no font of the PDF has the letter '漢' (U+6F22); expected --fonts"
+    )
     assert error.count("\n") == 1
     assert not Path("cert.pdf").exists()
     assert printed(lab, output="cert.xml")  # which takes every letter
@@ -119,7 +122,7 @@ def test_further_fonts_have_further_letters(printed, capsys):
     """Tifinagh is in DejaVu Sans, not in the fonts that typst brings."""
     lab = REVIEWED.replace("A. Example", "ⵣ. Example")
     assert printed(lab) == 2
-    assert "persons[0].name: no font of the PDF has the letter 'ⵣ' (U+2D63)" in capsys.readouterr().err
+    assert "lab.toml: persons 1: name: no font of the PDF has the letter 'ⵣ' (U+2D63)" in capsys.readouterr().err
     assert printed(lab, "tumble", "--fonts", "nowhere") == 2
     assert "fonts 'nowhere': expected a folder of fonts" in capsys.readouterr().err
     if not Path("/usr/share/fonts/truetype/dejavu/DejaVuSans.ttf").is_file():
@@ -233,7 +236,10 @@ def test_a_logo_lies_beside_the_file(printed, capsys):
     assert len(printed(lab)) > 10_000
     Path("logo.png").write_bytes(b"no picture")
     assert printed(lab.replace("logo.svg", "logo.png")) == 2
-    assert "imulab: laboratory.logo: the PDF cannot be laid out: failed to decode image" in capsys.readouterr().err
+    assert (
+        "imulab: lab.toml: laboratory.logo: the PDF cannot be laid out: failed to decode image"
+        in capsys.readouterr().err
+    )
     assert printed(lab.replace("logo.svg", "lab.toml")) == 2
     assert "expected a name that ends with .png, .jpg or .svg" in capsys.readouterr().err
 
@@ -357,6 +363,7 @@ def test_a_fleet_needs_numbers_of_their_own_and_days_that_hold(issue_all, capsys
             "item.serial 'S1': each unit of a fleet has its own; leave it",
         ),
         (("x", "x"), ["--limits", "limits.toml"], "limits.toml: limits need a rule that the customer agreed to"),
+        (("A. Example", "漢"), [], "lab.toml: persons 1: name: no font of the PDF has the letter '漢'"),
         (("x", "x"), ["--fonts", "nowhere"], "fonts 'nowhere': expected a folder of fonts"),
         (("x", "x"), ["--sign", "nothing.pem"], "nothing.pem"),
     ],
@@ -389,10 +396,18 @@ def test_limits_that_are_wrong_for_every_unit_are_refused_once(issue_all, capsys
     assert not Path("out").exists()
 
 
-def test_a_unit_whose_pdf_is_refused_has_no_xml_either(issue_all, capsys):
-    assert issue_all(number="漢-{serial}") == 2
-    assert "3 of 3 units have no certificate" in capsys.readouterr().err
-    assert list(Path("out").iterdir()) == []
+def test_a_unit_whose_pdf_is_refused_has_no_xml_either(line, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(line / "records", "records")
+    record = il.load("records/LINE-0002.json")
+    replace(record, sensor={**record.sensor, "model": "漢"}).save("records/LINE-0002.json")
+    lab = REVIEWED.replace("EX-2026-0042", "EX-{serial}").replace(
+        "[2026-11-24, 2026-11-24]", "[2026-03-01, 2026-03-31]"
+    )
+    Path("lab.toml").write_text(lab.replace("received = 2026-11-20\n", ""), encoding="utf-8")
+    assert main(["fleet", "certificate", "records", "--lab", "lab.toml", "-o", "out"]) == 2
+    assert "none: LINE-0002: the record: no font of the PDF has the letter '漢'" in capsys.readouterr().out
+    assert sorted(path.name for path in Path("out").iterdir()) == ["LINE-0001.pdf", "LINE-0001.xml"]
 
 
 def test_a_fleet_is_warned_of_the_template_by_what_its_records_hold(tmp_path, monkeypatch, capsys):

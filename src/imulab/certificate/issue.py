@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from msgspec.structs import replace
@@ -96,7 +97,7 @@ def write_certificate(
     made = _certificate(record, stated, limits)
     if before is not None:
         made = with_before(made, _certificate(before, stated, limits))
-    _write(made, [Path(path)], fonts, sign)
+    _write(made, [Path(path)], lab, fonts, sign)
 
 
 @checked
@@ -161,8 +162,12 @@ def write_fleet_certificates(
                 raise RecordError(f"it has no record: {store.reason(unit.serial) or 'fleet run makes it'}")
             made = _certificate(store.record(unit.serial), stated, limits)
             made = with_days_of_recordings(made)
-            _write(made, [Path(output) / f"{unit.serial}{ending}" for ending in (".xml", ".pdf")], fonts, sign)
+            _write(made, [Path(output) / f"{unit.serial}{ending}" for ending in (".xml", ".pdf")], lab, fonts, sign)
         except ImulabError as error:
+            if str(error).startswith(f"{lab}: "):  # and so for every unit
+                with suppress(OSError):  # it was there before, and holds files
+                    Path(output).rmdir()
+                raise
             refused[unit.serial] = str(error)
         if progress is not None:
             progress(count)
@@ -194,7 +199,9 @@ def _check_limits(limits: str, fleet: FleetState) -> None:
         raise OptionError(f"{limits}: no limits of a parameter of these records")
 
 
-def _write(certificate: Certificate, paths: list[Path], fonts: str | Path | None, sign: str | Path | None) -> None:
+def _write(
+    certificate: Certificate, paths: list[Path], lab: str | Path, fonts: str | Path | None, sign: str | Path | None
+) -> None:
     """Write the files of a certificate; all are made before the first is written, as a PDF may be refused."""
     xml = dcc_xml(certificate)
     if sign is not None:
@@ -205,7 +212,7 @@ def _write(certificate: Certificate, paths: list[Path], fonts: str | Path | None
     if any(path.suffix == ".pdf" for path in paths):
         from imulab.certificate.page import pdf  # typst is of an extra, and takes 20 ms to load
 
-        page = pdf(certificate, xml, None if fonts is None else str(fonts))
+        page = pdf(certificate, xml, str(lab), None if fonts is None else str(fonts))
         contents = [page if path.suffix == ".pdf" else xml for path in paths]
     for path, content in zip(paths, contents, strict=True):
         with replacing(path) as stream:

@@ -19,7 +19,7 @@ from msgspec import to_builtins
 
 from imulab.certificate.dcc import SCHEMA
 from imulab.certificate.digits import limits_text, printed_unit, rounded, significant, smaller_units, times_power
-from imulab.certificate.laboratory import Party
+from imulab.certificate.laboratory import Party, counted
 from imulab.certificate.model import Certificate, Result
 from imulab.certificate.texts import (
     Words,
@@ -39,7 +39,7 @@ _MOST_CORRELATED = 16
 _MISSING = re.compile(r"the text `?\"(.+?)\"`? could not be displayed")
 
 
-def pdf(certificate: Certificate, xml: bytes, fonts: str | None = None) -> bytes:
+def pdf(certificate: Certificate, xml: bytes, lab: str, fonts: str | None = None) -> bytes:
     """Return the certificate as a PDF that holds its XML; the same certificate gives the same bytes.
 
     Parameters
@@ -48,6 +48,8 @@ def pdf(certificate: Certificate, xml: bytes, fonts: str | None = None) -> bytes
         What is printed.
     xml
         The same as `dcc_xml` wrote it.
+    lab
+        Name of the laboratory's file in messages.
     fonts
         Folder of further fonts.
 
@@ -71,8 +73,8 @@ def pdf(certificate: Certificate, xml: bytes, fonts: str | None = None) -> bytes
         made: bytes = compiler.compile(format="pdf", pdf_standards=_STANDARDS, timestamp=day)
     except typst.TypstError as error:
         if missing := _MISSING.search(str(error)):
-            raise _no_letter(missing[1], certificate) from None
-        place = "laboratory.logo: " if "decode image" in str(error) else ""
+            raise _no_letter(missing[1], certificate, lab) from None
+        place = f"{lab}: laboratory.logo: " if "decode image" in str(error) else ""
         raise OptionError(f"{place}the PDF cannot be laid out: {str(error).splitlines()[0]}") from None
     return made
 
@@ -88,9 +90,11 @@ def load_typst(fonts: str | None) -> Any:
     return typst
 
 
-def _no_letter(letters: str, certificate: Certificate) -> OptionError:
+def _no_letter(letters: str, certificate: Certificate, lab: str) -> OptionError:
     """Say which letter no font has, and where it stands."""
-    places = (place for place, text in _texts(to_builtins(certificate.lab), "") if letters in text)
+    texts = _texts(to_builtins(certificate.lab), "")
+    serial = certificate.serial  # which the number may hold
+    places = (f"{lab}: {counted(place)}" for place, text in texts if letters in text.replace(serial, ""))
     codes = " ".join(f"U+{ord(letter):04X}" for letter in letters)
     return OptionError(
         f"{next(places, 'the record')}: no font of the PDF has the letter {letters!r} ({codes}); expected --fonts DIR "
