@@ -32,25 +32,36 @@ def noise(time, unit="s", seed=1):
         (0.1, "s", ""),
         (0.2, "s", "5000 Hz if it is in ms"),
         (0.19, "s", ""),
+        (200.0, "s", "(0.005 Hz): is the unit of time right: 5 Hz if it is in ms or 5000 Hz if it is in us?"),
     ],
 )
 def test_a_unit_of_time_that_cannot_be_right_is_said(step, unit, said):
-    _, notes = sampling_rate(noise(np.arange(1000) * step, unit))
+    _, notes = sampling_rate(noise(np.arange(100_000) * step, unit))
     assert len(notes) == bool(said)
     assert said in "".join(notes)
+
+
+@pytest.mark.parametrize(
+    ("step", "unit", "likely"),
+    [(200.0, "s", "5 Hz if it is in ms"), (0.1, "ms", "10 Hz if it is in s"), (1 / 300, "min", None), (0.2, "s", None)],
+)
+def test_a_unit_is_named_only_if_rate_and_duration_are_likely_then(step, unit, likely):
+    """Of 1000 samples: 5000 Hz would be over in 0.2 s, and who logs 10 kHz logs for longer than 0.1 s."""
+    _, notes = sampling_rate(noise(np.arange(1000) * step, unit))
+    assert [line.partition("right: ")[2].partition("?")[0] for line in notes] == ([likely] if likely else [])
 
 
 @pytest.mark.parametrize(
     ("start", "step", "kind"), [(0, 0.4, Note), (1.7e9, 0.4, Note), (1.7e12, 0.4, Finding), (0, 0.5, Finding)]
 )
 def test_a_slow_log_is_only_asked_for_its_unit_of_time_unless_its_dates_are_to_come(start, step, kind):
-    _, (line,) = sampling_rate(noise(start + np.arange(1000) * step))
+    _, (line,) = sampling_rate(noise(start + np.arange(100_000) * step))
     assert type(line) is kind
 
 
 def test_a_unit_of_time_that_was_stated_is_not_asked_for(tmp_path):
     """Of samples at 1 kHz in ms titled s every figure would be wrong; who states s has answered that."""
-    slow = noise(np.arange(4000.0))
+    slow = noise(np.arange(12_000.0))
     slow = slow.with_columns({"gyro_x": 0.01 * slow.column("gyro_x")}, {})
     assert il.fit_noise(slow).calibration.verdict.state == "look"
     assert sampling_rate(replace(slow, time_stated=True))[1] == []

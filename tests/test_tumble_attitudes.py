@@ -85,9 +85,13 @@ def test_every_hold_is_found_at_any_rate_and_noise(rate, noise):
     assert attitudes.unit == "m/s^2"
 
 
-@pytest.mark.parametrize(("rate", "doubted"), [(6.0, []), (4.0, [Note]), (0.4, [Finding])])
-def test_the_unit_of_time_is_doubted_by_the_rule_of_every_log(rate, doubted):
-    samples, time, _ = tumble(DIRECTIONS, rate=rate, hold=60.0, move=8.0)
+@pytest.mark.parametrize(
+    ("rate", "hold", "doubted"),
+    [(6.0, 60.0, []), (4.0, 60.0, []), (4.0, 1000.0, [Note]), (0.4, 60.0, [Finding])],
+    ids=["usual", "over in a second if it is in ms", "slow", "too slow"],
+)
+def test_the_unit_of_time_is_doubted_by_the_rule_of_every_log(rate, hold, doubted):
+    samples, time, _ = tumble(DIRECTIONS, rate=rate, hold=hold, move=8.0)
     notes = find_attitudes(recording(samples, time), window=5.0).notes
     assert [type(line) for line in notes if "unit of time" in line] == doubted
 

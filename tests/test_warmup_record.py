@@ -89,8 +89,8 @@ def refused(capsys: Any, folder: Path, recording: il.Recording, *options: str) -
         (lambda t: t + 20.0, "the first sample is 20 s after power-on; expected at most 5 s"),
         (lambda t: np.where(np.arange(len(t)) == 100, np.nan, t), "row 101"),
         (lambda t: np.where(np.arange(len(t)) == 100, t - 1.0, t), "runs backwards"),
-        (lambda t: 1e3 * t, "milliseconds titled as seconds"),
-        (lambda t: 1e-5 * t, "are these seconds"),
+        (lambda t: 1e3 * t, "expected 2e-05 to 4 s: is the unit of time right: "),
+        (lambda t: 1e-5 * t, "expected 2e-05 to 4 s: is the unit of time right?"),
     ],
     ids=["negative", "late", "nan", "backwards", "milliseconds", "too fast"],
 )
@@ -99,6 +99,18 @@ def test_apply_asks_of_time_what_fit_asks(folder: Path, capsys: Any, change: Any
     wrong = changed(recording, time=change(recording.columns["time"]))
     assert words in refused(capsys, folder, wrong)
     with pytest.raises(il.ImulabError, match=words.replace("(", ".")):
+        fit([*cycles()[1:], wrong])
+
+
+@pytest.mark.parametrize(("title", "factor", "right"), [("ms", 1.0, "s"), ("s", 1e3, "ms"), ("min", 1.0, "s")])
+def test_a_unit_of_time_that_is_wrong_is_asked_for_by_the_one_that_is_likely(
+    title: str, factor: float, right: str
+) -> None:
+    recording = cycle(3.0, 1)
+    wrong = replace(
+        changed(recording, time=factor * recording.columns["time"]), units={**recording.units, "time": title}
+    )
+    with pytest.raises(il.ImulabError, match=rf"is the unit of time right: 5 Hz if it is in {right}\?"):
         fit([*cycles()[1:], wrong])
 
 

@@ -26,7 +26,7 @@ from imulab.errors import DataError, OptionError, UnitError, several
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, choice, file, parsed, text
 from imulab.quantities import LARGEST, parse_units, span, whole, whole_number
-from imulab.units import parse_unit, to_si
+from imulab.units import ask_unit_of_time, parse_unit, to_si
 from imulab.views import AnyPlot, AnyPlots, views
 
 if TYPE_CHECKING:
@@ -716,10 +716,11 @@ def check_clock(recording: Recording, time: Array) -> None:
     steps = np.sort(np.diff(time))
     step = float(steps[(len(steps) - 1) // 2] + steps[len(steps) // 2]) / 2  # np.median loads a package for it
     if step > _SLOWEST or step < _FASTEST:
-        other = "milliseconds titled as seconds" if step > _SLOWEST else "seconds titled as a smaller unit"
+        unit = recording.units["time"]
+        asked = ask_unit_of_time(unit, 1 / step if step else math.inf, float(time[-1] - time[0]))
         raise DataError(
-            f"{recording.name}: column time [{recording.units['time']}]: a sample every {step:.4g} s; "
-            f"expected {_FASTEST:g} to {_SLOWEST:g} s: are these {other}?"
+            f"{recording.name}: column time [{unit}]: a sample every {step:.4g} s; expected {_FASTEST:g} to "
+            f"{_SLOWEST:g} s: {asked} --unit time=UNIT states it"
         )
 
 

@@ -256,6 +256,31 @@ def si_unit(symbol: str) -> str:
     return next((other.symbol for other in of_it if other.factor == 1.0 and other.offset == 0.0), unit.symbol)
 
 
+TIME_DOUBTED = "is the unit of time right"
+_LIKELY_RATES, _LIKELY_DURATIONS = (1.0, 10_000.0), (10.0, 7 * 86_400.0)
+"""Rates, Hz, and durations, s, of tests: what else a unit of time may be makes both likely."""
+
+
+def likely_times(unit: str, rate: float, duration: float) -> str:
+    """Return in which other units times of a rate, Hz, and a duration, s, are likely: ``100 Hz if it is in ms``."""
+    likely = []
+    for other in ("s", "ms", "us"):
+        factor = conversion_factor(other, unit)
+        if (
+            _LIKELY_RATES[0] <= rate / factor < _LIKELY_RATES[1]
+            and _LIKELY_DURATIONS[0] <= duration * factor <= _LIKELY_DURATIONS[1]
+            and other != unit
+        ):
+            likely.append(f"{rate / factor:.4g} Hz if it is in {other}")
+    return " or ".join(likely)
+
+
+def ask_unit_of_time(unit: str, rate: float, duration: float) -> str:
+    """Return the question whether a unit of time is right, with what else it may be."""
+    likely = likely_times(unit, rate, duration)
+    return f"{TIME_DOUBTED}{': ' if likely else ''}{likely}?"
+
+
 def conversion_factor(source: str, target: str) -> float:
     """Return the factor that turns an interval in `source` into one in `target`.
 

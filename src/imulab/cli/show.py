@@ -457,7 +457,8 @@ def describe_recording(blocks: Iterable[Recording]) -> str:
         text = summary.text()
         if len(last.clocks) > 1:
             text[:1] = [f"{clock} ({' '.join(names)}): {contents.columns[clock].finite} samples, {text[0]}"]
-        doubt = doubt_unit_of_time(last.units[clock], summary.rate) if summary.rate > 0 else ""
+        duration = summary.last - (summary.first or 0.0)
+        doubt = doubt_unit_of_time(last.units[clock], summary.rate, duration) if summary.rate > 0 else ""
         lines += [*text, *([f"{doubt} --unit time=UNIT states it"] if doubt else [])]
     if "time" not in last:
         lines.append("no time column: a table of attitudes, a row each")

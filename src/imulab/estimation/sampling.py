@@ -22,7 +22,7 @@ from imulab.recording import (
     state_rate,
     stored_as,
 )
-from imulab.units import to_si
+from imulab.units import ask_unit_of_time, likely_times, to_si
 
 WIDEST_GAP = 10.0
 """Most sampling intervals across which readings are interpolated."""
@@ -37,8 +37,7 @@ KILOHERTZ_IN_MS = 2.0
 TOO_SLOW = 5.0
 """Rate, Hz, up to which the unit of time is noted, for up to 5 kHz in ms titled s look like this, and doubted where
 there are too few samples to go on."""
-TIME_DOUBTED = "is the unit of time right"
-_USUAL = (10.0, 10_000.0)  # Hz: likely rates, for the guess at the right unit of time
+_MOMENT = 1.0  # s: a shorter recording is hardly one of a test
 BRIDGED, FEW = 0.01, 0.001
 """Largest share of rows without numbers; share of the rows below which what is bridged or left out is only noted."""
 
@@ -213,7 +212,7 @@ def sampling_rate(recording: Recording) -> tuple[float, list[str]]:
     lossy = is_lossy(recording)
     start, stop = steady_rows(time, lossy=lossy)
     clock = read_clock(time[start:stop], lossy=lossy)
-    odd = mislabelled(recording, clock.rate, float(time[0]), least=KILOHERTZ_IN_MS)
+    odd = mislabelled(recording, clock.rate, float(time[0]), float(time[-1] - time[0]), least=KILOHERTZ_IN_MS)
     odd = [prefixed(recording.name, line) for line in odd]
     if (start, stop) != (0, len(time)):
         return clock.rate, [_change(recording, time, start, stop), *odd]
@@ -340,8 +339,12 @@ def _change(recording: Recording, time: Array, start: int, stop: int) -> str:
     )
 
 
-def mislabelled(recording: Recording, rate: float, time: float, *, least: float = _SLOWEST) -> list[str]:
-    """Return whether the unit of time is right: a finding if the rate, Hz, is hardly a sensor's, a note if it is rare.
+def mislabelled(
+    recording: Recording, rate: float, time: float, duration: float, *, least: float = _SLOWEST
+) -> list[str]:
+    """Return whether the unit of time is right: a finding if rate or duration are hardly those of a test, or a note.
+
+    A rate that is only rare is noted where another unit makes rate and duration likely.
 
     Parameters
     ----------
@@ -351,16 +354,19 @@ def mislabelled(recording: Recording, rate: float, time: float, *, least: float 
         Its rate, Hz.
     time
         One of its stamps, s. A rare rate is a finding where that would be later than 2099 if it counts from 1970.
+    duration
+        From its first stamp to its last, s.
     least
         Rate, Hz, up to which there is a finding. Where time sets every figure, 1 kHz in ms titled s must not pass.
     """
     if recording.time_stated:
         return []
-    unit, late = recording.units["time"], time > EPOCHS[1]
-    doubt = doubt_unit_of_time(unit, rate, TOO_SLOW)
+    slow, short = rate <= TOO_SLOW, duration < _MOMENT
+    odd = not least < rate < _FASTEST or (slow and time > EPOCHS[1])
+    doubt = doubt_unit_of_time(recording.units["time"], rate, duration, rare=slow or short, odd=odd)
     if not doubt:
         return []
-    kind = Finding if late or not least < rate < _FASTEST else Note
+    kind = Finding if odd or short else Note
     return [
         kind(
             f"{doubt} If not, every figure that depends on time is wrong",
@@ -369,13 +375,20 @@ def mislabelled(recording: Recording, rate: float, time: float, *, least: float 
     ]
 
 
-def doubt_unit_of_time(unit: str, rate: float, slowest: float = _SLOWEST) -> str:
-    """Return the question whether a unit of time is right, where a rate, Hz, is beyond `slowest` to 20 kHz; else ""."""
-    if slowest < rate < _FASTEST:
+def doubt_unit_of_time(unit: str, rate: float, duration: float, *, rare: bool = False, odd: bool | None = None) -> str:
+    """Return the question whether a unit of time is right, or an empty text.
+
+    Parameters
+    ----------
+    unit, rate, duration
+        Of the times, their rate, Hz, and how long they last, s.
+    rare
+        Whether to ask where another unit makes rate and duration likely.
+    odd
+        Whether to ask anyhow; where the rate is none from 0.5 Hz to 20 kHz if None.
+    """
+    odd = not _SLOWEST < rate < _FASTEST if odd is None else odd
+    if not odd and not (rare and likely_times(unit, rate, duration)):
         return ""
-    others = {other: rate * to_si(1.0, unit) / to_si(1.0, other) for other in ("us", "ms", "s") if other != unit}
-    likely = [
-        f"{value:.4g} Hz if it is in {other}" for other, value in others.items() if _USUAL[0] <= value < _USUAL[1]
-    ]
-    guess = f": {' or '.join(likely)}" if likely else ""
-    return f"column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): {TIME_DOUBTED}{guess}?"
+    asked = ask_unit_of_time(unit, rate, duration)
+    return f"column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): {asked}"

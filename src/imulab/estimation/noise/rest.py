@@ -553,7 +553,7 @@ class _Log:
         bad = [bridged_line(head.name, self._bad, self._rows, self._first_bad)] if self._bad else []
         slow = [part.temperature for part in parts if part.temperature is not None]
         lengths = [part.count for part in parts]
-        timing = mislabelled(head, 1 / interval, float(self._time[0]), least=KILOHERTZ_IN_MS)
+        timing = mislabelled(head, 1 / interval, float(self._time[0]), self._duration, least=KILOHERTZ_IN_MS)
         return LongRest(
             head,
             interval,

@@ -26,12 +26,11 @@ from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.likely_unit import no_gravity
 from imulab.estimation.rows import MAD_TO_SIGMA, distinct, median, medians, quantile
-from imulab.estimation.sampling import TIME_DOUBTED
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, attitudes_and_samples
 from imulab.recording import Array, Recording, check_finite
 from imulab.records.comparison import different_units
-from imulab.units import parse_unit
+from imulab.units import TIME_DOUBTED, parse_unit
 
 # Recordings at rest while the temperature drifts: knocks, and wander of the direction.
 

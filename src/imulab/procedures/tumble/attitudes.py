@@ -26,7 +26,7 @@ from imulab.columns import triad
 from imulab.display import Finding, Note
 from imulab.errors import DataError, OptionError, SegmentError, UnitError
 from imulab.estimation.rows import distinct, leave_out, median, medians, quantile
-from imulab.estimation.sampling import TOO_SLOW, bridged, doubt_unit_of_time, mislabelled
+from imulab.estimation.sampling import bridged, doubt_unit_of_time, mislabelled
 from imulab.procedures.result import OWN_CLOCKS, as_recording
 from imulab.readers.streams import one_clock
 from imulab.recording import Array, Data, Reading, Recording, Sampling, check_finite, check_time, release, state_rate
@@ -723,7 +723,7 @@ def _notes(blocks: _Blocks, variance: Array, recording: Recording, time: Array) 
     """Return what is odd about the clock of the recording; the steps that are gaps lie in `blocks.broken`."""
     rate = blocks.length / blocks.duration
     lost = 1 - float(np.isfinite(variance).mean())
-    notes = mislabelled(recording, rate, float(time[0]))
+    notes = mislabelled(recording, rate, float(time[0]), float(time[-1] - time[0]))
     if blocks.broken.any():
         step = np.diff(time)
         gaps = np.flatnonzero(step > max(_GAP_SECONDS, _GAP_STEPS / rate))
@@ -766,7 +766,8 @@ def _window_width(blocks: _Blocks, recording: Recording, time: Array, window: fl
     width = max(3, round(window / blocks.duration))
     if len(blocks.mean) < 2 * width:
         duration = float(time[-1] - time[0])
-        doubt = doubt_unit_of_time(recording.units["time"], len(time) / duration, TOO_SLOW) if duration else ""
+        unit = recording.units["time"]
+        doubt = doubt_unit_of_time(unit, len(time) / duration, duration, rare=True) if duration else ""
         raise SegmentError(
             f"{recording.name}: {len(recording)} samples over {duration:.3g} s are too few to find static attitudes "
             f"with a window of {window:g} s{f'; {doubt} --unit time=UNIT states it' if doubt else ''}"

@@ -32,7 +32,7 @@ from imulab.recording import (
     power_on_temperature,
     state_power_on,
 )
-from imulab.units import conversion_factor, parse_unit, si_unit
+from imulab.units import ask_unit_of_time, conversion_factor, likely_times, parse_unit, si_unit
 
 # Recordings averaged over bins of one second, block by block.
 
@@ -40,6 +40,7 @@ from imulab.units import conversion_factor, parse_unit, si_unit
 BIN = 1.0
 """Width of a bin, s."""
 _DAY = 86400.0  # s: a longer cycle has another unit of time
+_MOMENT = 10.0  # s: a shorter one may have
 _AXIS = re.compile(r"(gyro|accel)_.+")
 
 
@@ -163,7 +164,7 @@ def find_power_cycle(
     pieces: list[tuple[np.ndarray, Array, Array]] = []
     head: Recording | None = None
     axes: tuple[str, ...] = ()
-    temperature, first, last, reading, zeros = np.nan, 0.0, -np.inf, None, 0
+    temperature, first, last, reading, zeros, rows = np.nan, 0.0, -np.inf, None, 0, 0
     for block in mend_blocks(blocks):
         time = check_time(block)
         if not time.size:
@@ -180,12 +181,8 @@ def find_power_cycle(
                 f"{block.name}: {block.place(0)}, column time: time does not rise: "
                 f"expected more than {last:.9g} s, found {time[0]:.9g} s"
             )
-        last = float(time[-1])
-        if last > _DAY:
-            raise DataError(
-                f"{block.name}: {block.place(len(time) - 1)}, column time: {last:.6g} s after power-on; expected a "
-                "power cycle of less than a day: are these milliseconds titled as seconds?"
-            )
+        last, rows = float(time[-1]), rows + len(time)
+        _check_length(block, first, last, rows)
         here = _empty_rows(block, axes)
         zeros += int(here.sum())
         if not here.all():
@@ -194,6 +191,7 @@ def find_power_cycle(
         raise DataError("no samples")
     if not pieces:
         raise DataError(f"{head.name}: every row is zero in {' '.join(axes)}")
+    _check_length(head, first, last, rows, ended=True)
     return Cycle(
         bins=_bins(pieces, [conversion_factor(head.units[axis], si_unit(head.units[axis])) for axis in axes]),
         axes=axes,
@@ -211,6 +209,20 @@ def find_power_cycle(
         zeros=zeros,
         corrected_by=head.corrected_by,
     )
+
+
+def _check_length(block: Recording, first: float, last: float, rows: int, *, ended: bool = False) -> None:
+    """Refuse a cycle of more than a day, and one that ended in a moment and is likely in another unit of time."""
+    unit, duration = block.units["time"], last - first or 1.0
+    asked = f"{ask_unit_of_time(unit, (rows - 1) / duration, duration)} --unit time=UNIT states it"
+    if last > _DAY:
+        raise DataError(
+            f"{block.name}: {block.place(len(block) - 1)}, column time: {last:.6g} s after power-on; expected a power "
+            f"cycle of less than a day: {asked}"
+        )
+    likely = likely_times(unit, (rows - 1) / duration, duration)
+    if ended and last < _MOMENT and likely and not block.time_stated:
+        raise DataError(f"{block.name}: column time [{unit}]: ends {last:.3g} s after power-on: {asked}")
 
 
 def _axes(recording: Recording) -> tuple[str, ...]:

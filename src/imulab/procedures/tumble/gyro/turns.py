@@ -169,7 +169,8 @@ def choose_turns(
         )
         notes.append(Note(sentence) if broken.sum() <= _FEW_BROKEN * turns.sum() else sentence)
     if len(chosen) < _FEWEST_TURNS:
-        if doubt := doubt_unit_of_time(attitudes.recording.units["time"], 1 / usual[0], TOO_SLOW):
+        unit, duration = attitudes.recording.units["time"], float(time[-1] - time[0])
+        if doubt := doubt_unit_of_time(unit, 1 / usual[0], duration, rare=1 / usual[0] <= TOO_SLOW):
             raise SegmentError(f"{name}: {doubt} --unit time=UNIT states it")
         aside = f" ({int(clipped.any(axis=1).sum())} more are clipped)" if clipped.any() else ""
         aside += f" ({int(broken.sum())} more have gaps)" if broken.any() else ""
