@@ -413,7 +413,7 @@ def test_the_command_writes_one_file_and_refuses_in_one_line(imulab, tmp_path):
             ["--to", "kalibr", "exact.json", "-o", "no", "--noise", "empty.json"],
             ["empty.json: expected what 'imulab allan"],
         ),
-        (["--to", "px4", "exact.json", "-o", ""], ["expected a folder"]),
+        (["--to", "px4", "exact.json", "-o", ""], ["-o '' is empty; expected DIR"]),
         (["--to", "px4", "noise.json", "-o", "no"], ["noise.json: not a calibration record"]),
     ):
         done = imulab("export", *arguments)

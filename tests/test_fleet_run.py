@@ -525,7 +525,10 @@ def test_no_report_is_written_over_a_record(imulab, tmp_path):
 def test_a_folder_without_a_name_is_refused(imulab, tmp_path):
     make_fleet(tmp_path / "in", 1)
     done = imulab("fleet", "run", "in/manifest.csv", "-o", "")
-    assert (done.returncode, done.stderr) == (2, "imulab: output '': expected the name of a folder to write to\n")
+    assert done.returncode == 2
+    assert done.stderr == "imulab: -o '' is empty; expected DIR; see 'imulab fleet run --help'\n"
+    with pytest.raises(OptionError, match="output '': expected the name of a folder to write to"):
+        run_fleet(tmp_path / "in" / "manifest.csv", "")
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
 
 
@@ -581,7 +584,7 @@ def test_a_simulated_line_is_found_as_it_was_made(imulab, tmp_path):
         (["--units", "7"], "--units 7: expected 8 to 2000"),
         (["--units", "many"], "--units 'many': expected a whole number"),
         (["--seed", "-1"], "--seed -1: expected a whole number from 0"),
-        (["-o", ""], "output '': expected the name of a folder to write to"),
+        (["-o", ""], "-o '' is empty; expected DIR; see 'imulab fleet simulate --help'"),
         (["-o", "file/line"], "file/line: the folder cannot be made: Not a directory"),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 
 import imulab as il
 from conftest import REPOSITORY
+from imulab.cli import main
 from imulab.cli.app import commands
 from imulab.display import Finding, one_thing
 from imulab.errors import ObservabilityError, OptionError, ReadError, readable
@@ -338,7 +339,20 @@ def test_a_folder_in_place_of_a_file_is_refused_with_the_file_in_it(imulab, tmp_
 )
 def test_no_name_of_a_file_is_refused(imulab, words):
     done = imulab(*words.split(), "")
-    assert (done.returncode, done.stderr) == (2, "imulab: expected the name of a file, found ''\n")
+    assert done.returncode == 2
+    line = r"imulab: an argument is empty; expected \S+, found ''; see 'imulab [\w ]+ --help'\n"
+    assert re.fullmatch(line, done.stderr)
+
+
+@pytest.mark.parametrize("empty", ["", " ", "\t"])
+def test_an_empty_value_of_any_option_is_refused_as_that(capsys, empty):
+    """A variable of a script that is not set; which file, folder or number is meant is not known."""
+    options = [(command, each) for command in commands() for each in command.options if each.takes_value]
+    assert len(options) > 600
+    for command, each in options:
+        assert main([*command.path.split(), f"{each.flags[-1]}={empty}"]) == 2
+        expected = f"imulab: {each.flags[-1]} {empty!r} is empty; expected {each.shows}; see 'imulab {command.path} "
+        assert capsys.readouterr().err.startswith(expected)
 
 
 @pytest.mark.parametrize("words", ["warmup simulate --temperatures 0 --cycles 1 --duration 60s", "thermal simulate"])

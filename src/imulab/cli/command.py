@@ -165,6 +165,8 @@ def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], s
             if value is None and not left:
                 raise OptionError(f"Option '{flag}' requires an argument.")
             text = left.pop(0) if value is None else value
+            if not text.strip():  # a variable of a script that is not set
+                raise refuse(f"{flag} {text!r} is empty; expected {each.shows}")
             typed[each.keyword] = [*typed.get(each.keyword, []), text] if each.kind == "texts" else text
         elif value is not None and flag.startswith("--"):
             raise OptionError(f"Option '{flag}' does not take a value.")
@@ -211,6 +213,9 @@ def _quoted(flag: str) -> str:
 
 def _given(command: Command, rest: list[str], refuse: Callable[[str], OptionError]) -> Iterator[tuple[str, Any]]:
     """Yield the arguments; what is left of `rest` is one too many."""
+    if not all(word.strip() for word in rest):
+        shown = " ".join(each.shows for each in command.arguments)
+        raise refuse(f"an argument is empty; expected {shown or 'none'}, found {' '.join(map(repr, rest))}")
     for each in command.arguments:
         if each.required and not rest:
             raise refuse(f"Missing argument '{each.shows}'")

@@ -12,7 +12,6 @@ import imulab as il
 from imulab.cli.command import Argument, Command, option
 from imulab.cli.options import AsJson, call, check_outputs, progress_bar, warn
 from imulab.display import SENTENCES
-from imulab.errors import OptionError
 from imulab.options import OUTPUT, choice
 
 if TYPE_CHECKING:
@@ -138,8 +137,6 @@ def simulate(
     Recordings of two calibrations of each unit, two manifests and limits. The zero of z drifts over the units, unit
     5 is far off, and unit 7 changes between its two calibrations.
     """
-    if not output:
-        raise OptionError("output '': expected the name of a folder to write to")
     first, second = call(il.simulate_fleet, output, **options)
     print(f"manifests: {first} {second}")
     print(f"limits: {first.parent / 'limits.toml'}")

@@ -269,8 +269,8 @@ def check_outputs(outputs: list[str | None], inputs: list[str], *, paper: bool =
     for name in outputs:
         if name is None:
             continue
-        if name in ("", "-"):
-            raise OptionError(f"output {name!r}: expected the name of a file to write")
+        if name == "-":
+            raise OptionError("output '-': expected the name of a file to write")
         if not paper:
             check_no_paper(name)
         target = real_path(name)
