@@ -97,7 +97,9 @@ def test_blanks_signs_and_zeros_around_a_number_do_not_matter(token):
     assert parse([token]) == ((1, 0, 1), [1.5])
 
 
-@pytest.mark.parametrize("token", ["nan", "NaN", "inf", "-inf", "Infinity", "1e400", "-1e-400", "0e99999", "9" * 400])
+@pytest.mark.parametrize(
+    "token", ["nan", "NaN", "inf", "-inf", "Infinity", "1e400", "-1e-400", "0e99999", "9" * 400, "0." + "1" * 1074]
+)
 def test_what_is_no_plain_decimal_reads_as_float_does(token):
     np.testing.assert_array_equal(parse([token])[1], [float(token)])
 
@@ -195,6 +197,10 @@ REFUSED = {
     "letters": (HEAD + FIFTY + b"0.5,x1,20\n", "row 50 (line 51), column accel_x: expected a number, found 'x1'"),
     "quoted": (HEAD + FIFTY + b'0.5,1,"2\n', "row 50 (line 51), column temperature: expected a number, found '\"2'"),
     "comments": (b"# a\n# b: c\n\n" + HEAD + FIFTY + b"?,1,2\n", "row 50 (line 54), column time: expected a number"),
+    "too long": (
+        HEAD + b"1,0.%s,2\n" % (b"1" * 1100),
+        "row 1 (line 2), column accel_x: expected a number of at most 1100 characters, found '0.111",
+    ),
     "long": (HEAD + b"1,%s,2\n" % (b"z" * 500), "row 1 (line 2), column accel_x: expected a number, found 'zzz"),
     "ragged short": (HEAD + FIFTY + b"0.5,1\n0.6,1,20\n", "row 50 (line 51): expected 3 fields, found 2"),
     "ragged long": (HEAD + FIFTY + b"0.5,1,20,4\n", "row 50 (line 51): expected 3 fields, found 4"),

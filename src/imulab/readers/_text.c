@@ -13,7 +13,8 @@
 #include <math.h>
 #include <string.h>
 
-enum { OK = 0, NOT_A_NUMBER = 1, WRONG_COUNT = 2, LONGEST_TOKEN = 400 }; /* 3, 4: of dates */
+enum { OK = 0, NOT_A_NUMBER = 1, WRONG_COUNT = 2, LONGEST_TOKEN = 1100 }; /* 3, 4: of dates;
+    the exact digits of any double have no more characters */
 /* Flag of a slot: the field is a date, the column takes nanoseconds since 1970 as int64; the order is in two bits. */
 enum { DATE = 1 << 30, ORDER = 28, FLAGS = DATE | 3 << ORDER };
 

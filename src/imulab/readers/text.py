@@ -356,6 +356,7 @@ _text.prepare(powers_of_five())
 _TITLE = re.compile(r"[^,\[\]]+\[[^,\[\]]+\]")
 _DATE, _DAY_FIRST, _MONTH_FIRST = 1 << 30, 1 << 28, 1 << 29  # flags of a column of dates, beyond any column's number
 _COLUMN = _DAY_FIRST - 1  # the number without flags
+_LONGEST = 1100  # characters of a number, as in C: the exact digits of any double are fewer
 _NOT_A_NUMBER, _WRONG_COUNT, _NOT_A_DATE, EITHER_ORDER = 1, 2, 3, 4  # problems that the parser in C reports
 _ARROW = re.compile(rb"^[ \t]*(\d?\d:\d\d:\d\d(?:[.:]\d+)?) -> ?", re.M)
 """What a serial monitor puts before each line."""
@@ -845,7 +846,8 @@ class TextFile:
         comma = " (a decimal comma? expected a point)" if re.fullmatch(r"[-+]?\d+,\d+", entry) else ""
         if comma and self._layout:
             comma += '; decimal = "," in the layout reads it'
-        raise ReadError(f"{place}, column {column}: expected a number, found {shown!r}{comma}")
+        wanted = "a number" if len(entry) <= _LONGEST else f"a number of at most {_LONGEST} characters"
+        raise ReadError(f"{place}, column {column}: expected {wanted}, found {shown!r}{comma}")
 
 
 def _arrow(layout: Layout, line: bytes) -> tuple[re.Pattern[bytes], bytes] | None:
