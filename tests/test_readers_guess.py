@@ -138,6 +138,20 @@ def turned_by_hand(real_data):
         yield rows[:, :3], rows[:, 3:6], "rad/s"
 
 
+def test_that_axes_may_be_swapped_or_reversed_is_said(tmp_path):
+    t, f, w = tilting()
+    found = il.guess_layout(
+        written(
+            tmp_path / "f.csv", "t (s),ay (g),-ax (g),az (g),gx (deg/s),gy (deg/s),gz (deg/s)", [t, *(f / G).T, *w.T]
+        )
+    )
+    assert found.toml.splitlines()[1].startswith(
+        "# Axes and their directions are as the titles say: swapped or reversed ones "
+    )
+    assert 'accel_x = { from = "-ax (g)", unit = "g" }' in found.toml
+    assert any(line.endswith("the minus of -ax (g) is not applied; scale = -1 applies it") for line in found.supposed)
+
+
 def test_a_hand_s_turns_tell_the_unit_of_rates_and_other_columns_do_not(real_data, tmp_path):
     titles = "ax,ay,az,gx,gy,gz"
     per = {"rad/s": 1.0, "deg/s": np.pi / 180}

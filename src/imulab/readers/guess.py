@@ -64,6 +64,9 @@ _EITHER = "either"
 _DATES = {"day first": '"iso", day_first = true', "month first": '"iso", day_first = false'}
 _RATE = "--sample-rate HZ"
 _BY_HAND = "; a layout can be written by hand: imulab show --formats ends with an example"
+_HEADING = """\
+Guessed by imulab layout guess from titles. A comment at a column says what its title does not.
+# Axes and their directions are as the titles say: swapped or reversed ones are not looked for in the readings."""
 _NO_GRAVITY = {"linear", "free", "user", "without", "nog"}
 _EXAMPLES = {"accel": "m/s^2", "gyro": "deg/s", "mag": "uT"}
 
@@ -492,6 +495,9 @@ def layout_of_table(
         titled[sensor] = unit
         if titles[places[0]].increment and "@" not in unit:
             unit, reason = _increments(unit, rate, titles[places[0]].text, name)
+        signed = " ".join(titles[place].text for place in places if titles[place].text.lstrip().startswith("-"))
+        if signed:
+            reason = "; ".join(filter(None, [reason, f"the minus of {signed} is not applied; scale = -1 applies it"]))
         for column, place in zip(triad(sensor), places, strict=True):
             chosen.append((column, place, known.get(column, unit), reason))
     warm = _temperature(titles, table, known)
@@ -508,7 +514,7 @@ def layout_text(
     chosen: Sequence[tuple[str, int, str, str]],
     left: Sequence[str],
     sample_rate: float | None,
-    heading: str = "Guessed by imulab layout guess from titles. A comment at a column says what its title does not.",
+    heading: str = _HEADING,
 ) -> str:
     """Return the text of a layout file; columns are named by title where that names one alone."""
     numbered = (
