@@ -380,6 +380,14 @@ def test_noise_that_is_not_known_is_a_comment_and_a_wrong_file_is_refused(tmp_pa
 # --- command line ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("option", [{"mag_device_id": 88}, {"mag_mount": "internal"}], ids=str)
+def test_options_of_magnetometers_have_no_effect_without_them_and_it_is_said(tmp_path, option):
+    told = []
+    il.export("px4", record(9, misalignment=0.0), tmp_path, device_id=7, tell=told.append, **option)
+    flag = f"--{next(iter(option)).replace('_', '-')}"
+    assert f"px4: {flag} has no effect: the record holds no magnetometers" in told
+
+
 def test_the_command_writes_one_file_and_refuses_in_one_line(imulab, tmp_path):
     record(9, misalignment=0.0).save(tmp_path / "exact.json")
     record(9).save(tmp_path / "rec.json")
@@ -395,11 +403,17 @@ def test_the_command_writes_one_file_and_refuses_in_one_line(imulab, tmp_path):
         assert done.returncode == 0, done.stderr
         (file,) = (tmp_path / target).iterdir()
         assert file.suffix == ending
+        idle = {"--device-id": target != "px4", "--noise": target not in ("kalibr", "openvins")}
+        assert {option: f"{target}: {option} has no effect: it is for " in done.stderr for option in idle} == idle
     assert programs.px4(tmp_path / "px4" / "imulab.params")[0]["CAL_ACC0_ID"] == 1246218
     for arguments, fragments in (
         (["--to", "px4", "rec.json", "-o", "no"], ["misalignment_yx", "within +-1 g", "--lossy"]),
         (["--to", "px4", "count.json", "-o", "no", "--lossy"], ["count"]),
         (["--to", "apm", "rec.json", "-o", "no"], ["'apm'", *EXPORTERS]),
+        (
+            ["--to", "px4", "exact.json", "-o", "no", "--device-id", "7", "--mag-device-id", "7"],
+            ["--mag-device-id 7: expected another number than device_id"],
+        ),
         (["--to", "px4", "exact.json", "-o", "no", "--device-id", "x"], ["--device-id 'x'"]),
         (["--to", "px4", "exact.json", "-o", "no", "--device-id", "-1"], ["--device-id -1"]),
         (["--to", "px4", "exact.json", "-o", "taken"], ["taken", "folder"]),

@@ -120,8 +120,6 @@ def export(
 
     Calibration records in the form of firmware, an autopilot or a toolbox.
     """
-    if not output:
-        raise OptionError("-o '': expected a folder to write to")
     to = options.pop("to")
     write = partial(il.export, records=records, folder=output, tell=warn)
     files = call(write, to=to, **options)

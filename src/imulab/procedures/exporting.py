@@ -26,6 +26,13 @@ from imulab.records.calibration import Calibration
 
 _FIRMWARE = ("c", "blob")
 _DEVICE_IDS = 2**32  # numbers of 32 bits
+_TAKEN_BY = {
+    "device_id": ("px4",),
+    "mag_device_id": ("px4",),
+    "noise": ("kalibr", "openvins"),
+    "mag_mount": ("px4", "ardupilot"),
+}
+"""Targets in which an option has an effect."""
 
 
 def _nothing(message: str) -> None:
@@ -80,8 +87,8 @@ def export(
         ``external`` where the autopilot turns the magnetometers by a rotation of their own, which then holds their
         mounting exactly; ``internal`` where it does not.
     tell
-        Called with a sentence on each loss that was allowed, on each record that is not good, and on PX4's device
-        number where it is not given.
+        Called with a sentence on each loss that was allowed, on each record that is not good, on PX4's device number
+        where it is not given, and on an option that has no effect.
 
     Returns
     -------
@@ -106,10 +113,7 @@ def export(
         raise OptionError(f"to {to!r}: unknown target; known targets: {listed(EXPORTERS, to)}")
     if mag_mount not in MAG_MOUNTS:
         raise OptionError(f"mag_mount {mag_mount!r}: expected one of {listed(MAG_MOUNTS, str(mag_mount))}")
-    number, mag_number = whole(device_id, "device_id"), whole(mag_device_id, "mag_device_id")
-    for name, each in (("device_id", number), ("mag_device_id", mag_number)):
-        if not 0 <= each < _DEVICE_IDS:
-            raise OptionError(f"{name} {each}: expected a number from 0 to {_DEVICE_IDS - 1}")
+    number, mag_number = _device_numbers(device_id, mag_device_id)
     if Path(folder).exists() and not Path(folder).is_dir():
         raise OptionError(f"{os.fspath(folder)}: expected a folder to write to, found a file")
     listed_records = list(records) if isinstance(records, Sequence) and not isinstance(records, str) else [records]
@@ -139,7 +143,35 @@ def export(
         noise_keys = noise if isinstance(noise, Mapping) else _read_noise(file)
     source = file if noise else ""
     options = ExportOptions(lossy, number, noise_keys, source, fusions, mag_mount, tell, mag_number, files)
-    return exporters.export(to, loaded, Path(folder), options)
+    written = exporters.export(to, loaded, Path(folder), options)
+    given = {"device_id": number, "mag_device_id": mag_number, "noise": noise, "mag_mount": mag_mount != MAG_MOUNTS[0]}
+    for line in _without_effect(to, [name for name, value in given.items() if value], loaded):
+        tell(line)
+    return written
+
+
+def _device_numbers(device_id: int | str, mag_device_id: int | str) -> tuple[int, int]:
+    """Return PX4's numbers of the sensors and of the magnetometers; 0 is not known."""
+    number, mag_number = whole(device_id, "device_id"), whole(mag_device_id, "mag_device_id")
+    for name, each in (("device_id", number), ("mag_device_id", mag_number)):
+        if not 0 <= each < _DEVICE_IDS:
+            raise OptionError(f"{name} {each}: expected a number from 0 to {_DEVICE_IDS - 1}")
+    if number and number == mag_number:
+        raise OptionError(f"mag_device_id {number}: expected another number than device_id, as of another chip")
+    return number, mag_number
+
+
+def _without_effect(to: str, given: Sequence[str], records: Sequence[Calibration]) -> list[str]:
+    """Return a sentence on each option that has no effect."""
+    parameters = {name for record in records for name in record.parameters}
+    with_mag = any(name.startswith("mag_") for name in parameters)
+    lines = []
+    for name in given:
+        if to not in _TAKEN_BY[name]:
+            lines.append(f"{to}: --{name.replace('_', '-')} has no effect: it is for {' and '.join(_TAKEN_BY[name])}")
+        elif name.startswith("mag_") and not with_mag:
+            lines.append(f"{to}: --{name.replace('_', '-')} has no effect: the record holds no magnetometers")
+    return lines
 
 
 def _choose_fusions(to: str, stated: Mapping[str, Any], records: Sequence[Calibration]) -> list[Fusion | None]:
