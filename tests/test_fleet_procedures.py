@@ -178,7 +178,7 @@ def test_the_report_shows_gyroscopes_in_the_units_that_people_read(line, monkeyp
     found = dict(re.findall(r"\b((?:gyro_)?(?:bias|scale_factor|misalignment)\w+) (\S+) 1 ", text))
     assert found["gyro_bias_x"] == "deg/h"
     assert found["gyro_bias_x_t1"] == "deg/h/K"
-    assert found["bias_x_t2"] == "µg/K^2"
+    assert found["bias_x_t2"] == "µg/K²"
     assert "gyro_scale_factor_y ppm off nominal 1 " in text
     assert found["scale_factor_y_t1"] == "ppm/K"
     assert found["gyro_misalignment_zy"] == "mrad"

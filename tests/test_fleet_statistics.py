@@ -290,13 +290,15 @@ def test_dates():
         ("1/(m/s^2)^2", 1e-6 / 9.80665**2, "µg/g³", 1.0),
         ("rad/s/(m/s^2)", math.radians(1) / 3600 / 9.80665, "deg/h/g", 1.0),
         ("count/(m/s^2)", 512.0, "count/g", 5021.0048),
+        ("m/s^2/K^2", 9.80665e-6, "µg/K²", 1.0),
     ],
 )
 def test_units_that_people_read(unit, value, shown, text):
     read = reading_unit(unit)
     assert read.symbol == shown
     assert read.of(value) == pytest.approx(text, rel=1e-9)
-    assert to_parameter_unit(text, shown, unit) == pytest.approx(value, rel=1e-12)
+    for typed in (shown, shown.replace("µ", "u").replace("²", "^2").replace("³", "^3")):
+        assert to_parameter_unit(text, typed, unit) == pytest.approx(value, rel=1e-12)
     assert to_parameter_unit(value, unit, unit) == value
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import imulab as il
-from conftest import table
+from conftest import REPOSITORY, table
 from imulab.errors import RecordError
 from imulab.procedures.views import exhibits_of
 from imulab.report import render_page
@@ -17,6 +17,7 @@ from imulab.report.traces import Exhibits, Figure, ReportTable, correlation_map,
 from reference import tumble as reference
 
 G = 9.80665
+WRITTEN = REPOSITORY / "tests" / "data" / "written_by" / "0.2.0"
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,14 @@ def test_the_page_refers_to_nothing_outside(record, tmp_path):
     own = re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
     assert not re.search(r"""(?:src|href|@import|url\()\s*=?\s*["']?(?:https?:)?//""", own)
     assert page.count("</html>") == 1
+
+
+@pytest.mark.parametrize("name", ["tumble", "thermal_gyro", "centrifuge"])
+def test_powers_in_units_are_written_in_one_way(tmp_path, name):
+    il.write_report(il.load(WRITTEN / f"{name}.json"), tmp_path / "r.html")
+    page = re.sub(r"<script>.*?</script>", "", (tmp_path / "r.html").read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert "²" in page
+    assert re.findall(r"\S*(?:/[sKg]|\))\^\S*", page) == []
 
 
 def test_the_report_says_what_the_record_holds(record, tmp_path):

@@ -23,7 +23,7 @@ from imulab.estimation.distributions import chi_square_upper_quantile, normal_cd
 from imulab.files import check_keys, load_toml, number_of
 from imulab.procedures.registry import PROCEDURES
 from imulab.recording import Array
-from imulab.report.parameters import reading_unit
+from imulab.report.parameters import reading_unit, with_superscripts
 from imulab.units import conversion_factor
 
 Rule = Literal["simple", "guarded", "bands"]
@@ -113,7 +113,8 @@ def to_parameter_unit(value: float, unit: str, target: str, name: str = "") -> f
     read = reading_unit(target, name)
     if unit == target:
         return value
-    if unit in (read.symbol, read.of_difference, read.symbol.replace("µ", "u")):
+    plain = with_superscripts(unit).replace("µ", "u")
+    if plain in (read.symbol.replace("µ", "u"), read.of_difference):
         return (value - read.offset) / read.factor
     try:
         return value * conversion_factor(unit, target)

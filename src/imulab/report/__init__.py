@@ -14,6 +14,7 @@ from msgspec import Struct
 
 from imulab.display import SENTENCES, Verdict
 from imulab.records.calibration import Calibration
+from imulab.report.parameters import with_superscripts
 from imulab.report.traces import Exhibits, Figure, ReportTable, narrow
 
 _HEADS = {"good": "Good", "look": "Look first", "bad": "Stop"}
@@ -105,9 +106,13 @@ def _template(name: str) -> Any:
     from jinja2 import Environment, FunctionLoader, StrictUndefined
     from markupsafe import Markup
 
+    def written(value: Any) -> Any:
+        return with_superscripts(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
     environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(_file)
-    )
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(_file),
+        finalize=written,
+    )  # fmt: skip
     environment.globals |= {
         "policy": _policy, "style": Markup(_file("style.css")), "sentences": SENTENCES, "heads": _HEADS,
     }  # fmt: skip

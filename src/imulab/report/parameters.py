@@ -61,6 +61,12 @@ _PER_KELVIN = re.compile(r"(.+?)(/K(?:\^\d)?)")
 _PER_KELVIN_SMALL = {"mg": ("µg", 1e3), "mrad": ("µrad", 1e3)}
 _NONLINEARITY = re.compile(r"1/\((m/s\^2|rad/s)\)(?:\^(\d))?")
 _POWERS = "⁰¹²³⁴⁵⁶⁷⁸⁹"
+_EXPONENT = re.compile(r"(/[sKg]|\))\^(\d)")
+
+
+def with_superscripts(text: str) -> str:
+    """Return a text whose units have their powers as people write them: ``m/s²`` for ``m/s^2``."""
+    return _EXPONENT.sub(lambda power: power[1] + _POWERS[int(power[2])], text)
 
 
 class ReadingUnit(Struct, frozen=True):
@@ -128,7 +134,7 @@ def reading_unit(unit: str, name: str = "") -> ReadingUnit:
     if (law := _PER_KELVIN.fullmatch(unit)) is not None:
         whole = reading_unit(law[1], name)
         symbol, more = _PER_KELVIN_SMALL.get(whole.symbol, (whole.of_difference, 1.0))
-        return ReadingUnit(symbol + law[2], whole.factor * more)
+        return ReadingUnit(with_superscripts(symbol + law[2]), whole.factor * more)
     if (power := _NONLINEARITY.fullmatch(unit)) is not None:
         degree = int(power[2] or 1)
         if power[1] == "m/s^2":
