@@ -207,7 +207,7 @@ def test_an_array_fuses_as_before(tmp_path, kind):
     _same(out, BEFORE / f"array{'.blob' if kind == 'blob' else ''}.expected.csv")
 
 
-@pytest.mark.parametrize("name", ["tumble", "warmup", "centrifuge", "array"])
+@pytest.mark.parametrize("name", ["tumble", "six_axes", "warmup", "centrifuge", "array"])
 def test_a_record_is_shown_drawn_and_written_again_as_before(tmp_path, capsys, name):
     record = BEFORE / f"{name}.json"
     assert main(["show", str(record)]) == 0

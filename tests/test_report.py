@@ -101,9 +101,17 @@ def test_a_report_needs_nothing_but_the_saved_record(record, tmp_path):
     assert (tmp_path / "now.html").read_bytes() == (tmp_path / "later.html").read_bytes()
 
 
-def test_a_record_without_the_data_for_its_figures_is_refused(record, tmp_path):
-    with pytest.raises(RecordError, match=r"^the record lacks data\.attitudes$"):
-        il.write_report(replace(record, data={}), tmp_path / "r.html")
+def test_a_record_without_the_data_for_its_figures_has_its_parameters_and_says_what_is_not_there(record, tmp_path):
+    il.write_report(replace(record, data={}), tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "The record lacks data.attitudes: its parameters alone are shown; fit again for all figures." in page
+    for name in record.parameters:
+        assert f">{name}<" in page
+
+
+def test_a_record_with_something_else_in_place_of_the_data_for_its_figures_is_refused(record, tmp_path):
+    with pytest.raises(RecordError, match=r"^data\.attitudes: expected "):
+        il.write_report(replace(record, data={**record.data, "attitudes": 1.0}), tmp_path / "r.html")
     assert not list(tmp_path.iterdir())
 
 

@@ -26,7 +26,7 @@ from imulab.procedures.result import Drawn, Record, as_read, as_record
 from imulab.recording import Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import RecordComparison, compared
-from imulab.report.parameters import Row, reading_unit
+from imulab.report.parameters import Row, parameters_table, reading_unit
 from imulab.report.traces import (
     BAD,
     GOOD,
@@ -47,14 +47,21 @@ if TYPE_CHECKING:
 
 
 def exhibits_of(record: Calibration) -> Exhibits:
-    """Return the figures and tables of a record.
+    """Return the figures and tables of a record; of one that lacks the data that they need, its parameters alone.
 
     Raises
     ------
     RecordError
-        Its procedure is not known, or it lacks the data that they need.
+        Its procedure is not known, or it has something else in place of that data.
     """
-    exhibits = procedure_of(record).exhibits(record)
+    try:
+        exhibits = procedure_of(record).exhibits(record)
+    except RecordError as error:
+        if not str(error).startswith("the record lacks ") or not record.parameters:
+            raise
+        table = parameters_table(parameter_rows(record), "u is the standard uncertainty, – where none is stated.")
+        headline = f"{str(error).capitalize()}: its parameters alone are shown; fit again for all figures."
+        return Exhibits(headline, [], [table])
     for procedure in joined_of(record):
         more = procedure.joined(record)
         exhibits = replace(
