@@ -67,8 +67,8 @@ imulab array compare array.csv --calibration array_calibration.json -o array.jso
         "warm-up",
         "How large is the bias of the minutes after power-on, and what is left with a table in the unit?",
         """
-imulab warmup simulate --rate "1 Hz" -o warmup
-imulab warmup fit warmup/*.csv --model auto -o warmup.json --report warmup.html
+imulab warmup simulate --rate "0.8 Hz" --duration "20 min" --cycles 2 -o warmup
+imulab warmup fit warmup/*.csv --model auto --settling-time "15 min" -o warmup.json --report warmup.html
 """,
         "warmup.json",
         "warmup.html",
