@@ -206,7 +206,7 @@ def test_the_field_of_a_simulated_unit_goes_on_from_turn_to_turn():
         ("tcp:no.such.host.invalid:80", "no machine of this name|cannot be opened"),
         ("udp:seven", "expected a whole number"),
         ("serial:/dev/ttyS0@fast", "expected a whole number"),
-        ("simulate:colour=red", "the keys being seed order"),
+        ("simulate:colour=red", r"the keys being seed order rate \[Hz\] noise \[mg\] .* bare numbers in these units$"),
         ("simulate:noise=1s", "acceleration"),
         ("simulate:rate=1", "sample rate 1"),
         ("simulate:speed=-1", "speed -1"),

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import OptionError, ReadError, listed
+from imulab.errors import OptionError, ReadError, listed, meant
 from imulab.live.links import CHUNK, GONE, AbsentError, Link, LinkKind, reason, serial_link, tcp_link, udp_link
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.quantities import number, quantity, whole_number
@@ -170,7 +170,11 @@ def simulated_unit(text: str, *, follow: bool) -> tuple[SimulatedUnit, float]:
         key, equals, value = (part.strip() for part in pair.partition("="))
         where = f"simulate: {key}"
         if key not in _KEYS or not equals:
-            raise OptionError(f"simulate:{text}: expected key=value, the keys being {listed(_KEYS, key)}")
+            keys = " ".join(f"{each} [{_KINDS[each][1]}]" if each in _KINDS else each for each in _KEYS)
+            raise OptionError(
+                f"simulate:{text}: expected key=value, the keys being {keys}, bare numbers in these units"
+                f"{meant(_KEYS, key)}"
+            )
         if key == "unit":
             settings[key] = value
         elif key == "speed":

@@ -165,13 +165,14 @@ def simulate_noise(
         White noise, 0.3 deg/sqrt(h) or 100 ug/sqrt(Hz); SI without a unit. N, angle or velocity random walk,
         unit/sqrt(Hz).
     flicker
-        1/f noise, such as 5 deg/h. B, in the unit of the output.
+        1/f noise, such as 5 deg/h; SI without a unit. B, in the unit of the output.
     walk
-        Random walk, such as 3 deg/h/sqrt(h). K, rate or acceleration random walk, unit/sqrt(s).
+        Random walk, such as 3 deg/h/sqrt(h); SI without a unit. K, rate or acceleration random walk, unit/sqrt(s).
     quantisation
-        Quantisation of the angle, such as 1 arcsec. Q, of the angle or velocity, unit s.
+        Quantisation of the angle, such as 1 arcsec; SI without a unit. Q, of the angle or velocity, unit s.
     gm
-        Gauss-Markov noise, such as '20 deg/h:300 s'; once or twice. Standard deviation and correlation time.
+        Gauss-Markov noise, such as '20 deg/h:300 s'; once or twice; SI without units. Standard deviation and
+        correlation time.
     from_
         In place of terms: those of a record of noise fit. Or its file, whose chosen models are simulated, column by
         column.
