@@ -411,10 +411,16 @@ REFUSED = {
     "no gravity": (LAB + STANDARD.replace("standard_unc", "#"), "expected standard_uncertainty of gravity"),
     "rule": (
         LAB + '[conformity]\nrule = "guard"\nagreed = "a"\nspecification = "b"\n',
-        "conformity.rule: unknown 'guard'; known: simple guarded bands; did you mean 'guarded'?",
+        "conformity.rule: expected bands or guarded or simple, found 'guard'",
     ),
-    "language": (re.sub(r"(?m)^(language = .*\n)?location =", 'language = "fr"\nlocation =', LAB), "known: en de"),
-    "text for a number": (LAB.replace("value = 23.0", 'value = "23"'), "].value: expected a number, found a text"),
+    "language": (
+        re.sub(r"(?m)^(language = .*\n)?location =", 'language = "fr"\nlocation =', LAB),
+        "expected de or en, found 'fr'",
+    ),
+    "text for a number": (
+        LAB.replace("value = 23.0", 'value = "23"'),
+        "conditions 1: value: expected a number, found '23'",
+    ),
     "not TOML": ("[certificate", "the laboratory file is not TOML"),
 }
 
