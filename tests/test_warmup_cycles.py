@@ -116,6 +116,15 @@ def test_what_cannot_be_a_power_cycle_is_refused(recording, words):
         find_power_cycle(recording)
 
 
+def test_rows_of_zeros_before_power_on_are_no_part_of_the_cycle():
+    off = a_cycle().column("time") < 20
+    columns = {axis: np.where(off, 0.0, a_cycle().column(axis)) for axis in ("gyro_x", "gyro_y")}
+    logged_before = a_cycle().with_columns(columns, {})
+    with pytest.raises(DataError, match=r"c\.csv: row 1001, column time: every axis is zero before 20 s, as before"):
+        find_power_cycle(logged_before)
+    assert find_power_cycle(logged_before, latest_start=30).first == pytest.approx(20.0)
+
+
 def test_a_late_start_is_taken_when_told():
     assert find_power_cycle(shifted(a_cycle(), 5.01), latest_start=6).first == pytest.approx(5.01)
 

@@ -7,6 +7,7 @@ functions good to fourth order, and 60,000 samples cost no more than 600.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import shared_unit
 from imulab.errors import DataError, UnitError
-from imulab.estimation.rows import median, medians, quantile
+from imulab.estimation.rows import distinct, median, medians, quantile
 from imulab.estimation.sampling import mend_blocks
 from imulab.recording import (
     LATEST_START,
@@ -41,6 +42,7 @@ BIN = 1.0
 """Width of a bin, s."""
 _DAY = 86400.0  # s: a longer cycle has another unit of time
 _MOMENT = 10.0  # s: a shorter one may have
+_OF_STEPS = 5000  # samples of a block that show the steps of its outputs
 _AXIS = re.compile(r"(gyro|accel)_.+")
 
 
@@ -94,6 +96,8 @@ class Cycle:
         Temperature at power-on, degC.
     first, last
         Time of the first and the last sample, s since power-on.
+    steps
+        Smallest step between different values of each axis, shape (axes,); 0 where all are the same.
     name, serial, sensor_model
         Name for messages; serial number and model from the head of the file.
     first_reading
@@ -114,6 +118,7 @@ class Cycle:
     temperature: float
     first: float
     last: float
+    steps: Array
     name: str
     serial: str | None = None
     first_reading: float | None = None
@@ -162,6 +167,7 @@ def find_power_cycle(
     """
     blocks = [recording] if isinstance(recording, Recording) else recording
     pieces: list[tuple[np.ndarray, Array, Array]] = []
+    steps: list[Array] = []
     head: Recording | None = None
     axes: tuple[str, ...] = ()
     temperature, first, last, reading, zeros, rows = np.nan, 0.0, -np.inf, None, 0, 0
@@ -176,29 +182,30 @@ def find_power_cycle(
             temperature = _power_on(block, temperature_from_column, reading)
             check_start(block, first, latest_start)
             check_clock(block, time)
-        elif time[0] <= last:
-            raise DataError(
-                f"{block.name}: {block.place(0)}, column time: time does not rise: "
-                f"expected more than {last:.9g} s, found {time[0]:.9g} s"
-            )
+        _check_rises(block, time, last)
         last, rows = float(time[-1]), rows + len(time)
         _check_length(block, first, last, rows)
         here = _empty_rows(block, axes)
         zeros += int(here.sum())
         if not here.all():
+            if not pieces:
+                first = _first_reading_time(block, time, int(np.argmin(here)), latest_start)
             pieces.append(_accumulate(block, axes, time, ~here if here.any() else None))
+            steps.append(np.array([_step(block.columns[axis]) for axis in axes]))
     if head is None:
         raise DataError("no samples")
     if not pieces:
         raise DataError(f"{head.name}: every row is zero in {' '.join(axes)}")
     _check_length(head, first, last, rows, ended=True)
+    factors = [conversion_factor(head.units[axis], si_unit(head.units[axis])) for axis in axes]
     return Cycle(
-        bins=_bins(pieces, [conversion_factor(head.units[axis], si_unit(head.units[axis])) for axis in axes]),
+        bins=_bins(pieces, factors),
         axes=axes,
         units=tuple(si_unit(head.units[axis]) for axis in axes),
         temperature=temperature,
         first=first,
         last=last,
+        steps=np.where(np.isfinite(smallest := np.min(steps, axis=0)), smallest * factors, 0.0),
         name=head.name,
         serial=head.metadata.get("serial"),
         first_reading=reading,
@@ -209,6 +216,32 @@ def find_power_cycle(
         zeros=zeros,
         corrected_by=head.corrected_by,
     )
+
+
+def _check_rises(block: Recording, time: Array, last: float) -> None:
+    """Refuse a block that begins no later than the `last` time before it, s."""
+    if time[0] <= last:
+        raise DataError(
+            f"{block.name}: {block.place(0)}, column time: time does not rise: "
+            f"expected more than {last:.9g} s, found {time[0]:.9g} s"
+        )
+
+
+def _first_reading_time(block: Recording, time: Array, row: int, latest_start: float) -> float:
+    """Return the time of the first row that is not zero in all axes, s; refuse one that is too late."""
+    first = float(time[row])
+    if row and first > latest_start:
+        raise DataError(
+            f"{block.name}: {block.place(row)}, column time: every axis is zero before {first:.6g} s, as before "
+            f"power comes on; expected readings from at most {latest_start:g} s on: leave those rows out and let time "
+            "count from power-on (--latest-start allows more)"
+        )
+    return first
+
+
+def _step(values: Array) -> float:
+    """Return the smallest step between different values of some samples; infinite where all are the same."""
+    return float(np.diff(distinct(values[:: 1 + len(values) // _OF_STEPS])).min(initial=np.inf))
 
 
 def _check_length(block: Recording, first: float, last: float, rows: int, *, ended: bool = False) -> None:
@@ -419,6 +452,7 @@ def with_axes(cycle: Cycle, wanted: tuple[str, ...]) -> Cycle:
         cycle,
         bins=bins,
         axes=wanted,
+        steps=cycle.steps[index],
         units=tuple(cycle.units[i] for i in index),
         file_units=tuple(cycle.file_units[i] for i in index),
     )
@@ -690,9 +724,11 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
     """Return the bins in which the unit stood still, and the seconds left out with the time of the first motion.
 
     In a bin with motion the variance is far above `quiet` and above what the warm-up curve makes of it, or the mean
-    stands apart from those around it, as after a knock that fills a bin.
+    stands apart from those around it, as after a knock that fills a bin. Outputs in steps that are coarser than their
+    noise rest at one value and change between two: a step is no motion.
     """
     bins = cycle.bins
+    quiet = np.maximum(quiet, np.square(cycle.steps) / 12)
     slope = np.gradient(bins.mean, axis=0) if len(bins) > 1 else 0.0
     excess = bins.variance - np.square(slope) / 12
     noise = _MOVED * (1 + 10 / bins.count[:, None]) * quiet
@@ -701,6 +737,7 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
     steps = np.diff(bins.mean, axis=0)
     usual = medians(np.abs(steps - medians(steps, 0)), 0) if len(steps) else np.inf
     alone = _APART**2 * np.maximum(quiet / bins.count[:, None], (1.05 * usual) ** 2)
+    alone += np.square(cycle.steps)
     moved = np.zeros(len(bins), dtype=np.bool_)
     while not moved.all():
         # The curve's range is taken from bins at rest: in motion a larger range would hide the motion.
@@ -715,7 +752,13 @@ def _still(cycle: Cycle, quiet: Array) -> tuple[CycleBins, tuple[float, float]]:
     near = np.convolve(moved, [1, 1, 1], mode="same") > 0
     began = float(bins.start[np.argmax(near)])
     if (~near).sum() < 2 * _FEWEST:
-        raise DataError(f"{cycle.name}: the unit moved from {began:g} s on: {int((~near).sum())} s at rest are too few")
+        axis = int(np.argmax(medians(bins.variance / np.maximum(quiet, 1e-300), 0)))
+        louder = math.sqrt(median(bins.variance[:, axis]) / max(float(quiet[axis]), 1e-300))
+        raise DataError(
+            f"{cycle.name}: the unit moved from {began:g} s on: {int((~near).sum())} s at rest are too few (noise of "
+            f"{cycle.axes[axis]} {louder:.3g} times that at rest): was it shaken, or is the unit of that column "
+            "another than in the other files?"
+        )
     return bins.where(~near), (float(near.sum()), began)
 
 

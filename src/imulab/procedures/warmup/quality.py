@@ -18,7 +18,7 @@ from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, first_of
 from imulab.estimation.decisions import STILL_DRIFTS
 from imulab.estimation.likely_unit import STATE_UNIT, no_gravity
-from imulab.estimation.rows import median, medians
+from imulab.estimation.rows import median, medians, quantile
 from imulab.procedures.correction_order import parse_thermals
 from imulab.procedures.warmup.cycles import SETTLED, Curves, Cycle
 from imulab.procedures.warmup.model import (
@@ -423,10 +423,12 @@ def _warn_dead_columns(curves: Curves) -> list[str]:
     for cycle in curves.cycles:
         still = (cycle.bins.variance == 0) & (cycle.bins.count > 1)[:, None]
         constant = still.all(axis=0) & (np.ptp(cycle.bins.mean, axis=0) == 0)
+        # where steps are larger than the noise, repeats are no fault, and a variance is at most step^2 / 4
+        coarse = [quantile(v, 0.75) < step**2 for v, step in zip(cycle.bins.variance.T, cycle.steps, strict=True)]
         for i, axis in enumerate(cycle.axes):
             if constant[i]:
                 stuck.setdefault(axis, []).append(cycle.name)
-            elif (longest := _longest(still[:, i])) >= _PAUSE and still[:, i].mean() < _MOSTLY:
+            elif (longest := _longest(still[:, i])) >= _PAUSE and still[:, i].mean() < _MOSTLY and not coarse[i]:
                 paused.setdefault(axis, []).append(f"{cycle.name} ({longest} s)")
     for axis, names in stuck.items():
         messages.append(
