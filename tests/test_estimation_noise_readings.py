@@ -66,6 +66,19 @@ def test_repeats_that_cannot_be_undone_are_said():
     assert "column gyro_y: every reading stands in 2 rows" in note
     assert "fitted alone (--columns)" in note
     assert il.fit_noise(irregular).calibration.verdict.state == "look"
+    few = np.arange(COUNT) - (np.arange(COUNT) % 33 == 7)  # 3 %, which make the white noise 3 % too large
+    assert "3 % of the rows repeat the readings before" in own_readings(gyros(x[few]), ["gyro_x", "gyro_y"])[1][0]
+
+
+@pytest.mark.parametrize("step", [0.0, 0.02, 0.1])
+def test_a_column_that_is_stuck_for_a_while_is_said(step):
+    """100 s of 400 s of one gyroscope; steps of up to its noise, and the others are noisy meanwhile."""
+    x = white()
+    x[10_000:20_000, 1] = x[10_000, 1]
+    x = step * np.round(x / step) if step else x
+    (note,) = own_readings(gyros(x), ["gyro_x", "gyro_y", "gyro_z"])[1]
+    assert note.startswith("log.csv: column gyro_y keeps one value for 10000 rows, 100 to 199.99 s")
+    assert il.fit_noise(gyros(x)).calibration.verdict.state == "look"
 
 
 @pytest.mark.parametrize("mean", [0.0, 0.03, 0.1, 0.2, -0.1, 0.5])

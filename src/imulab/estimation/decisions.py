@@ -277,6 +277,7 @@ LEVEL_STEP_PERHAPS = Decision(
 FOLLOWS_COVARIATE = Decision(
     0.00137, "verdict", {"noise": 12}, "a column follows the time or the temperature", limit=3.2
 )
+COLUMN_STUCK = Decision(1e-6, "verdict", {"noise": 6}, "a column keeps one value for longer than its noise makes it")
 SPECTRAL_LINE = Decision(1e-9, "note", {"noise": 1_000_000}, "a coefficient of the spectrum belongs to a line")
 BIN_OFF_MODEL = Decision(5.7e-7, "note", {"noise": 1000}, "a bin of the spectrum is off the model", limit=5.0)
 NOISE_CHECK = Decision(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from imulab.columns import kind_of, triad
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError
+from imulab.estimation.decisions import COLUMN_STUCK
 from imulab.estimation.likely_unit import STATE_UNIT, no_gravity
 from imulab.estimation.noise_coefficients import resolution
 from imulab.estimation.rows import deviation_of_steps, distinct, median
@@ -113,6 +114,8 @@ _COARSE = 0.25
 """Standard deviations: with larger steps of the output, zeros cannot be recognised as lost readings."""
 _LONGEST, _REGULAR, _FEWEST_READINGS = 50, 0.98, 20
 """Most rows of one reading; least share of readings that stand for a multiple of these rows; fewest readings."""
+_REPEATED = 0.01  # share of repeated rows above what chance makes: the white noise is that much too large
+_STUCK = 20  # rows of one value from which a column may be stuck
 _FINE, _REPEATS_PER_STEP = 4.0, 0.27
 """Steps of output in the usual change from which repeats are no chance, which makes 0.27 over their number of them."""
 
@@ -129,6 +132,7 @@ def own_readings(recording: Recording, names: Sequence[str]) -> tuple[Recording,
         More than 5 % of a column are zeros in place of lost readings.
     """
     recording, notes = _bridge_dropouts(recording, names)
+    notes += _stuck(recording, names)
     held = {name: _rows_of_a_reading(recording.column(name)[:_SEEN]) for name in names}
     rows = set(held.values())
     if len(rows) == 1 and (count := rows.pop()) > 1:
@@ -220,6 +224,32 @@ def _bridge_dropouts(recording: Recording, names: Sequence[str]) -> tuple[Record
     return recording.with_columns(columns, {}), [note]
 
 
+def _stuck(recording: Recording, names: Sequence[str]) -> list[str]:
+    """Return a message for each column that keeps one value for longer than its noise allows by chance."""
+    notes: list[str] = []
+    for name in names:
+        changes = np.flatnonzero(np.diff(recording.column(name)))
+        edges = np.concatenate([[-1], changes, [len(recording) - 1]])
+        length = np.diff(edges)
+        long = length >= _STUCK
+        repeats = float((length - 1)[~long].sum() / max(length[~long].sum(), 1))
+        long &= len(recording) * np.maximum(repeats, 1e-3) ** np.minimum(length, 1000.0) < COLUMN_STUCK.level
+        rows = int(length[long].sum())
+        if not 0 < rows < len(recording) / 2 or repeats > 0.5:  # steps coarser than the noise repeat by themselves
+            continue
+        time = recording.si("time")
+        first, last = int(edges[:-1][long][0]) + 1, int(edges[1:][long][-1])
+        kind = Note if rows < FEW * len(recording) else Finding
+        notes.append(
+            kind(
+                f"{recording.name}: column {name} keeps one value for {rows} rows, {time[first]:.6g} to "
+                f"{time[last]:.6g} s, while it is noisy elsewhere: a stuck link, which makes all its noises wrong",
+                "choose a part without it (--window), or check the link and record it again",
+            )
+        )
+    return notes
+
+
 def _rows_of_a_reading(values: Array) -> int:
     """Return the rows that every reading stands for; 1 where that varies or every row is a reading."""
     changes = np.diff(np.flatnonzero(values[1:] != values[:-1]))
@@ -251,7 +281,7 @@ def _repeated(columns: Sequence[Array], kinds: Sequence[str]) -> float:
             steps = np.abs(np.diff(values))
             usual = median(steps[steps > 0]) / resolution(values) if steps.any() else 0.0
             chance = _REPEATS_PER_STEP / usual if usual >= _FINE else 1.0
-        if share > 3 * chance + _MOST:
+        if share > 3 * chance + _REPEATED:
             largest = max(largest, share)
     return largest
 
