@@ -32,7 +32,7 @@ def recording(mounting="+z", way=WAY, hold=3.0, frequency=50.0, unit="rad/s", co
     """One run by the reference simulator."""
     table = reference.steps(way, hold, frequency)
     axis, sign = "xyz".index(mounting[1]), 1 if mounting[0] == "+" else -1
-    out = reference.outputs(table, frequency, axis, sign, SCALE, TURN, BIAS, **how)
+    out = reference.outputs(table, frequency, axis, sign, SCALE, TURN, **{"bias": BIAS} | how)
     factor = 1 / DEGREE if unit == "deg/s" else 1.0
     columns = {"time": np.arange(len(table)) / frequency}
     columns |= {f"gyro_{a}": factor * out[:, i] for i, a in enumerate("xyz")}
@@ -269,9 +269,9 @@ def changed(made, **columns):
     return dataclasses.replace(made, columns={**made.columns, **columns})
 
 
-def _clipped():
+def _clipped(limit=150.0):
     made = recording(noise=1e-3, rng=np.random.default_rng(1), column=False)
-    return changed(made, gyro_z=np.clip(made.column("gyro_z"), -150 * DEGREE, 150 * DEGREE))
+    return changed(made, gyro_z=np.clip(made.column("gyro_z"), -limit * DEGREE, limit * DEGREE))
 
 
 def _slipped():
@@ -291,11 +291,24 @@ REFUSED = {
         "turned one way round only",
     ),
     "too short": (lambda: il.fit_rate(recording(hold=0.4)), "are the steps too short"),
+    "one row": (
+        lambda: il.fit_rate({"gyro": np.zeros((1, 3))}, rate=50, unit="deg/s", rates="0,10,-10"),
+        "stretches of a steady rate: 0, expected 3",
+    ),
+    "at rest": (
+        lambda: il.fit_rate({"gyro": np.zeros((500, 3))}, rate=50, unit="deg/s", rates="0,10,-10"),
+        "stretches of a steady rate: 1, .* does the rate never change",
+    ),
     "one too short": (
         lambda: il.fit_rate(recording(column=False), rates=[*RATES, 150 * DEGREE]),
         "no dwell of 2 s or longer at 150 deg/s",
     ),
     "clipped": (lambda: il.fit_rate(_clipped(), rates=RATES), "its output is saturated"),
+    "clipped within the noise": (lambda: il.fit_rate(_clipped(201.9), rates=RATES), "its output is saturated"),
+    "the largest was not run": (
+        lambda: il.fit_rate(recording(column=False), rates=[*RATES, 300 * DEGREE]),
+        "no dwell of 2 s or longer at 300 deg/s",
+    ),
     "wrong axis": (lambda: il.fit_rate(recording(), axis="+x"), "are seen by gyro_z, not by gyro_x"),
     "slipped": (lambda: il.fit_rate(_slipped(), rates=RATES), "did the table slip"),
     "sign": (lambda: il.fit_rate(recording(), axis="-z"), "is the sign of mounting wrong"),
@@ -546,6 +559,48 @@ def test_a_kink_at_zero_is_said_since_no_power_of_the_rate_compensates_it():
     assert [type(w) for w in coarse.warnings if "with a kink" in w] == [Note]
     bent = changed(made, gyro_z=made.column("gyro_z") + 1e-4 * SCALE[2] * rate**2)
     assert il.fit_rate(bent).linearity["z"].kink is None
+
+
+def test_a_rate_that_is_listed_wrong_is_to_be_looked_at_and_named():
+    """100 deg/s that the table ran as 101, both ways round: half of S is off by 4 of its standard uncertainties."""
+    made = recording(way=[101 * np.sign(r) if abs(r) == 100 else r for r in SEVEN], noise=5e-5, column=False,
+                     rng=np.random.default_rng(3))  # fmt: skip
+    record = il.fit_rate(made, rates=np.array(SEVEN) * DEGREE, table_uncertainty="100 ppm").calibration
+    said = [w for w in record.warnings if "may some of the table's be off" in w]
+    assert record.verdict.state == "look"
+    assert re.search(r"most at -?100 deg/s", said[0])
+
+
+def test_a_drift_over_time_is_named_and_is_no_asymmetry():
+    """1000 ppm and 0.05 deg/s over the run: positive rates, which come first, differ from negative ones."""
+    made = recording(way=SEVEN, noise=5e-5, rng=np.random.default_rng(3))
+    rate, past = reference.steps(SEVEN, 3.0, 50.0), np.linspace(-0.5, 0.5, len(made))
+    drifted = changed(made, gyro_z=made.column("gyro_z") + SCALE[2] * past * (1e-3 * rate + 0.05 * DEGREE))
+    steady, fit = il.fit_rate(made, table_uncertainty="10 ppm"), il.fit_rate(drifted, table_uncertainty="10 ppm")
+    assert steady.linearity["z"].drift is None
+    scale, zero = fit.linearity["z"].drift
+    assert (scale, zero) == (pytest.approx(1e-3, rel=0.2), pytest.approx(0.05 * DEGREE, rel=0.2))
+    assert fit.calibration.verdict.state == "look"
+    assert any("does the temperature change?" in reason for reason in fit.calibration.verdict.reasons)
+    asymmetry = fit.calibration.parameters["gyro_asymmetry_z"]
+    assert abs(asymmetry.value) < 4 * asymmetry.standard_uncertainty < 2e-4
+    scale_factor = fit.calibration.parameters["gyro_scale_factor_z"]
+    assert abs(scale_factor.value - SCALE[2]) < 3 * scale_factor.standard_uncertainty
+
+
+def test_steps_of_the_output_that_are_coarser_than_its_noise_are_in_the_uncertainties():
+    """Steps of 0.25 deg/s and noise of a fifth of that: all visits of a rate are rounded alike."""
+    errors = []
+    for seed in range(4):
+        made = recording(way=SEVEN, noise=0.05 * DEGREE, rng=np.random.default_rng(seed), bias=BIAS + 1e-3 * seed)
+        read = {name: np.round(made.column(name) / DEGREE / 0.25) * 0.25 * DEGREE for name in ("gyro_z",)}
+        record = il.fit_rate(changed(made, **read), table_uncertainty="1 ppm").calibration
+        assert [type(w) for w in record.warnings if "gyro_z: its output comes in steps of 0.00436 rad/s" in w] == [Note]
+        scale, asymmetry = (record.parameters[f"gyro_{name}_z"] for name in ("scale_factor", "asymmetry"))
+        errors.append((scale.value - SCALE[2]) / scale.standard_uncertainty)
+        errors.append(asymmetry.value / asymmetry.standard_uncertainty)
+    assert np.abs(errors).max() < 3
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
 def test_a_bend_beyond_the_order_that_was_asked_for_is_said():

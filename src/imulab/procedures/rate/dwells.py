@@ -685,7 +685,7 @@ sweep passes at one output where that is saturated."""
 _NEXT_TO = 0.3  # of the gap between listed rates: a dwell that is nearer to one belongs to it
 _ALIKE, _OUT = 5e-3, 5.0
 """Visits of one rate differ at most by this share of the largest rate, or so many times their median difference."""
-_STANDS = 0.2  # of the usual scatter: a dwell at an end of the range that scatters less is saturated
+_STANDS, _TIES = 0.2, 0.2  # of the usual scatter; of a dwell's samples at one limit: less, or more, is saturated
 _WRONG = 0.5  # of the largest span: where the axis that the manifest names spans less, another was turned
 _ROUNDING = 1e-9  # of the largest reading: smaller scatter is rounding
 _ROBUST = 0.6745 * np.sqrt(2)  # median of the absolute difference of two normal values, over their sigma
@@ -766,8 +766,8 @@ def find_dwells(recording: Recording, test: RateTest, index: int) -> Dwells:
         return _reduce_swept_run(recording, time, column, outputs, names, main, place)
     if len(stretches) < 3:
         raise SegmentError(
-            f"{place}: {len(stretches)} stretches of a steady rate found, expected 3 or more of 2 s or longer: are the "
-            "steps too short?"
+            f"{place}: stretches of a steady rate: {len(stretches)}, expected 3 or more of 2 s or longer: are the "
+            "steps too short, or does the rate never change?"
         )
     mean = np.array([[values[a:b].mean() for values in outputs] for a, b in stretches])
     reading = mean[:, names.index(main)] * run.sign
@@ -850,7 +850,7 @@ def _smallest_step(rates: tuple[float, ...], output: Array) -> float:
 def _block_size(time: Array) -> int:
     """Return the number of samples in 0.1 s, by the median step of 10,000 samples over the recording."""
     which = np.linspace(0, len(time) - 2, min(len(time) - 1, 10_000)).astype(np.int64)
-    return max(1, round(_BLOCK / float(np.median(time[which + 1] - time[which]))))
+    return max(1, round(_BLOCK / float(np.median(time[which + 1] - time[which])))) if len(time) > 1 else 1
 
 
 def _block_means(signal: Array, size: int) -> Array:
@@ -913,14 +913,15 @@ def _check_ends(
     noisy = usual > _ROUNDING * float(np.abs(reading).max())
     if noisy:  # where a count is larger than the noise, outputs stand still at any rate
         first, last = stretches[int(np.argmin(np.abs(spread - usual)))]
-        noisy = usual > float(np.diff(np.unique(output[first:last])).min(initial=np.inf))
+        values, counts = np.unique(output[first:last], return_counts=True)
+        noisy = usual > float(np.diff(values).min(initial=np.inf)) and counts.max() < (last - first) / 2
     for end in (int(np.argmax(reading)), int(np.argmin(reading))):
-        if noisy and spread[end] < _STANDS * usual:
-            a, b = stretches[end]
-            reading_there = float(recording.column(main)[a:b].mean())
+        a, b = stretches[end]
+        limit = output[a:b].max() if reading[end] > 0 else output[a:b].min()
+        if noisy and (spread[end] < _STANDS * usual or np.mean(output[a:b] == limit) > _TIES):
             raise DataError(
-                f"{place}: {main} stands still at {reading_there:.6g} {recording.units[main]} in the dwell at "
-                f"{recording.si('time')[a]:.1f} s: its output is saturated; expected rates within its range"
+                f"{place}: {main} stands still at {recording.column(main)[a:b].mean():.6g} {recording.units[main]} in "
+                f"the dwell at {recording.si('time')[a]:.1f} s: its output is saturated; expected rates in its range"
             )
 
 
@@ -946,19 +947,20 @@ def _assign_listed_rates(
     scale = float(np.ptp(reading) / np.ptp(listed))
     nominal = parse_unit(recording.units[main])
     first = from_si(1.0, nominal.symbol) if nominal.quantity == "rate" else scale
+    low, high = (to_si(float(end), nominal.symbol) for end in (reading.min(), reading.max()))
     if not 0.7 < scale / first < 1.4:
-        low, high = (to_si(float(end), nominal.symbol) for end in (reading.min(), reading.max()))
         raise SegmentError(
             f"{place}: {main} saw {_degrees(low)} to {_degrees(high)}, the listed rates are {_degrees(listed[0])} to "
             f"{_degrees(listed[-1])} deg/s: is a rate missing, or the unit or a sign wrong?"
         )
     zero = float(reading.min() - scale * listed[0])
     if nominal.quantity == "rate" and abs(zero) > _WRONG / 2 * np.ptp(reading):
-        low, high = (to_si(float(end), nominal.symbol) for end in (reading.min(), reading.max()))
         raise SegmentError(
             f"{place}: about this axis {main} saw {_degrees(low)} to {_degrees(high)} deg/s, the listed rates are "
             f"{_degrees(listed[0])} to {_degrees(listed[-1])} deg/s: is the sign of mounting wrong?"
         )
+    lines = (scale, zero), (first, 0.0)  # the second where the largest listed rate was not run
+    scale, zero = min(lines, key=lambda ab: np.median(np.abs((reading[:, None] - ab[1]) / ab[0] - listed).min(axis=1)))
     gap = np.diff(listed).min()
     for _ in range(2):
         read_rates = (reading - zero) / scale
@@ -977,7 +979,7 @@ def _assign_listed_rates(
         raise SegmentError(
             f"{place}: in the dwell at {time[a]:.1f} to {time[b - 1]:.1f} s {main} is at {_degrees(seen_rate)} deg/s "
             f"{by}, none of the listed rates {', '.join(map(_degrees, listed))} deg/s: did the table slip, is a listed "
-            "rate missing or wrong, or the mounting's sign?"
+            "rate missing or wrong, the output saturated, or the mounting's sign wrong?"
         )
     order, nearest_order = ([rate for rate, _ in groupby(each)] for each in (rates, nearest.tolist()))
     if order == [-rate for rate in nearest_order] != nearest_order:

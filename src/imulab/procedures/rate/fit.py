@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
+from imulab.estimation.rows import distinct
 from imulab.gravity import EARTH, checked_latitude
 from imulab.options import choice, measure, parsed
 from imulab.procedures.rate import AXES, MOUNTINGS, ORDERS, name_gyroscopes, parse_fraction, parse_rates
@@ -43,6 +44,8 @@ from imulab.quantities import in_si
 from imulab.recording import Data, Reading, Recording
 from imulab.records.calibration import Calibration
 from imulab.records.comparison import different_units
+
+_OF_STEPS = 500  # samples of a dwell that show the steps of an output
 
 
 @dataclass(frozen=True, repr=False)
@@ -177,7 +180,7 @@ def fit_test(
     """Calibrate the gyroscopes of a test from the recordings of its runs; what is raised is as for `fit_rate`."""
     names, unit = _check_recordings(test, recordings)
     dwells = [find_dwells(recording, test, index) for index, recording in enumerate(recordings)]
-    problem, axes = _join_dwells(test, dwells, names), None
+    problem, axes = _with_rounding(_join_dwells(test, dwells, names), recordings, dwells, names), None
     if accel is not None:
         axes = find_axes(test, recordings, dwells, accel)
         problem = _apply_table_axes(test, problem, axes)
@@ -291,6 +294,27 @@ def _join_dwells(test: RateTest, dwells: Sequence[Dwells], names: list[str]) -> 
         branch=np.concatenate([_rising_or_falling(run_dwells) for run_dwells in dwells]),
         time=np.concatenate([(run_dwells.start + run_dwells.stop) / 2 for run_dwells in dwells]),
     )
+
+
+def _with_rounding(
+    problem: RateProblem, recordings: Sequence[Recording], dwells: Sequence[Dwells], names: list[str]
+) -> RateProblem:
+    """Return the problem with the uncertainty of means by steps that are coarser than the noise of a dwell.
+
+    Up to half a step, as uniform; noise of half a step and more leaves less than a hundredth of it. Visits of one rate
+    are rounded alike, but for a hundredth.
+    """
+    largest = np.zeros(len(names))
+    for recording, run_dwells in zip(recordings, dwells, strict=True):
+        if run_dwells.sweep is not None:
+            continue
+        edges = np.searchsorted(recording.si("time"), np.column_stack([run_dwells.start, run_dwells.stop]))
+        for i, name in enumerate(names):
+            parts = [recording.column(name)[a:b] for a, b in edges.tolist()]
+            step = min(float(np.diff(distinct(part[:_OF_STEPS])).min(initial=np.inf)) for part in parts)
+            if np.median([part.std() for part in parts]) < step / 2 < np.inf:
+                largest[i] = max(largest[i], step / np.sqrt(12))
+    return replace(problem, rounding=largest, variance=problem.variance + (0.01 * largest) ** 2)
 
 
 def _rising_or_falling(dwells: Dwells) -> NDArray[np.int64]:

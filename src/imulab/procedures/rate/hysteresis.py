@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.estimation.decisions import HYSTERESIS_SCATTERS
+from imulab.estimation.decisions import DWELLS_SCATTER, HYSTERESIS_SCATTERS
 from imulab.estimation.distributions import normal_cdf, t_cdf
-from imulab.estimation.least_squares import chi_square_probability
+from imulab.estimation.least_squares import chi_square_probability, f_test
 from imulab.recording import Array
 
 _BY_PARTS = 15
@@ -31,6 +31,7 @@ _BY_PARTS = 15
 _NONE = 0.8  # probability beforehand that dwells do not scatter, nor zeros walk, nor a scale factor drift, each
 _LEAST, _GRID, _COARSE, _MANY = 0.3, 5, 2, 150
 """Least variance of scatter, walk and drift over that of noise, and number of variances, fewer from so many dwells."""
+_DRIFTS = 0.1  # of chi-square without drift: where less is left, the dwells scatter since they drift
 _SHAPES: tuple[Callable[[Array], Array], ...] = (
     lambda x: 1 - x**2,
     lambda x: np.where(x < 1 - 1e-9, 1.0, 0.0),
@@ -46,6 +47,38 @@ def fit_weighted(columns: Array, values: Array, variance: Array) -> tuple[Array,
     inverse = np.linalg.pinv(scaled)
     coefficients = inverse @ (values * weight) / size
     return values - columns @ coefficients, np.column_stack([coefficients, inverse @ inverse.T / np.outer(size, size)])
+
+
+def fit_drift(
+    rate: Array, values: Array, variance: Array, runs: NDArray[Any], time: Array, powers: Array
+) -> tuple[Array, float, float] | None:
+    """Return what a line over time in each run adds to the outputs, and the changes of slope and zero over a run.
+
+    The zero and the slope over the rate change by ``a t`` and ``c t``, t the time from the middle of the run. None
+    where that leaves more than a tenth of what `powers` of the rate and zeros of the runs leave, or chance may do it.
+
+    Parameters
+    ----------
+    rate, values, variance, runs, time
+        As for `fit_loop`, but rates and outputs in rad/s, shape (n,).
+    powers
+        Columns of the model without drift, shape (n, k).
+    """
+    which = (runs[:, None] == np.unique(runs)).astype(np.float64)
+    within = time - which @ ((time @ which) / which.sum(axis=0))
+    lines = np.column_stack([which * within[:, None], which * (within * rate)[:, None]])
+    before = float(np.sum(fit_weighted(powers, values, variance)[0] ** 2 / variance))
+    left, fitted = fit_weighted(np.column_stack([powers, lines]), values, variance)
+    after, freedom = float(np.sum(left**2 / variance)), len(rate) - powers.shape[1] - lines.shape[1]
+    if freedom < 1 or after > _DRIFTS * before or chi_square_probability(before, freedom) > DWELLS_SCATTER.level:
+        return None
+    size = powers.shape[1]
+    if f_test(before, size, after, size + lines.shape[1], len(rate)) > DWELLS_SCATTER.level:
+        return None
+    slopes = fitted[size:, 0]
+    lasts = np.array([np.ptp(time[runs == run]) for run in np.unique(runs)])
+    zero, scale = (lasts * part for part in np.split(slopes, 2))
+    return lines @ slopes, float(np.sqrt(np.mean(scale**2))), float(np.sqrt(np.mean(zero**2)))
 
 
 def find_directions(rate: Array, runs: NDArray[np.int64]) -> NDArray[np.int64]:

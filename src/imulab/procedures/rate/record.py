@@ -167,6 +167,7 @@ def make_record(
             *_warn_line(
                 linearity, parameters, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order
             ),
+            *_note_rounding(problem, unit),
             *_note_scatter(problem, solution),
             *(warn_faces(test, recordings, dwells) if axes is None else note_lean(axes, test)),
             *note_sweeps(test, dwells),
@@ -352,6 +353,16 @@ def _warn_line(
     """Return warnings of what the chosen powers of the rate do not compensate: bends, kinks and hysteresis."""
     messages: list[str] = []
     for axis, line in linearity.items():
+        scale = parameters[f"gyro_scale_factor_{axis}"]
+        known = (scale.standard_uncertainty or 0.0) / abs(scale.value)
+        if line.drift is not None:
+            text = (
+                f"gyro_{axis}: over a run the scale factor drifts by {1e6 * line.drift[0]:.3g} ppm and the zero by "
+                f"{text_in(line.drift[1], 'deg/h', 3)} deg/h: does the temperature change?"
+            )
+            action = "let the unit warm up, keep the temperature, and run the rates again"
+            drifts = max(line.drift[0], line.drift[1] / float(np.abs(line.rate).max()))
+            messages.append(Note(text) if drifts < known else Finding(text, action))
         if asked != "auto" and line.probability < LINE_BENDS.level and line.by_polynomial > line.by_noise:
             messages.append(
                 Finding(
@@ -361,13 +372,16 @@ def _warn_line(
                 )
             )
         elif asked == "auto" and line.probability < LINE_BENDS.level and orders[axis] == 1:
-            messages.append(
-                Note(
-                    f"gyro_{axis}: the output bends by {1e6 * line.nonlinearity[0]:.3g} ppm of the largest rate, "
-                    "beyond the noise of its dwells, and no power of the rate predicts single rates better: may some "
-                    "of the table's be off? (--order 2 to 5 fits powers all the same)"
-                )
+            residuals = {rate: np.mean(line.residual[line.rate == rate]) for rate in line.rate.tolist()}
+            worst = max(residuals, key=lambda rate: abs(residuals[rate]))
+            text = (
+                f"gyro_{axis}: the output bends by {1e6 * line.nonlinearity[0]:.3g} ppm of the largest rate, most at "
+                f"{text_in(worst, 'deg/s', 4)} deg/s, beyond the noise of its dwells, and no power of the rate "
+                "predicts single rates better: may some of the table's be off, or did the zero jump? (--order 2 to 5 "
+                "fits powers all the same)"
             )
+            action = f"compare the rates listed for {axis} with those that the table ran"
+            messages.append(Note(text) if line.nonlinearity[0] < known else Finding(text, action))
         if line.kink is not None:
             text = (
                 f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * line.kink:+.3g} ppm, with a "
@@ -375,8 +389,6 @@ def _warn_line(
                 "largest rate are left"
             )
             action = "use the calibration for one sign of the rate, or check the table at low rates"
-            scale = parameters[f"gyro_scale_factor_{axis}"]
-            known = (scale.standard_uncertainty or 0.0) / abs(scale.value)
             messages.append(Note(text) if line.by_polynomial < known else Finding(text, action))
         if line.loop is not None and line.loop < HYSTERESIS.level and line.hysteresis is not None:
             messages.append(
@@ -387,6 +399,18 @@ def _warn_line(
                 )
             )
     return messages
+
+
+def _note_rounding(problem: RateProblem, unit: str) -> list[str]:
+    """Return a note for each gyroscope whose output comes in steps coarser than its noise."""
+    return [
+        Note(
+            f"gyro_{AXES[axis]}: its output comes in steps of {np.sqrt(12) * problem.rounded(i):.3g} {unit}, coarser "
+            f"than its noise: each rate is read to {problem.rounded(i):.2g} {unit}, which is in the uncertainties"
+        )
+        for i, axis in enumerate(problem.gyros)
+        if problem.rounded(i)
+    ]
 
 
 def _note_scatter(problem: RateProblem, solution: RateSolution) -> list[str]:
