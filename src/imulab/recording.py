@@ -567,7 +567,7 @@ LARGE = 1 << 28
 
 
 _AT_ONCE = 1 << 18  # rows of a column in a temporary file that are converted together
-_KEPT = 1 << 20  # numbers, 8 MB: more than the blocks that a file is read in
+_KEPT = (1 << 22) - (1 << 12)  # numbers, just below 32 MB: the most that the C library takes for a measure
 
 
 def is_large(file: str | PathLike[str] | None) -> bool:
