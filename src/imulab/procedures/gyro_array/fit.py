@@ -162,13 +162,18 @@ def _blocks_of_rows(count: int) -> Iterator[slice]:
 
 def _readings_si(recording: Recording, elements: Elements, rows: slice = slice(None)) -> Array:
     """Return the readings of all rows or some, rad/s, shape (m, axes, n), with those of a gyro side by side."""
-    columns = dict(recording.columns)  # which gives back the memory of columns on disk below, for all at once
     readings = np.empty((len(elements.axes), elements.count, len(range(*rows.indices(len(recording))))))
+    _fill_si(readings, recording, elements, rows)
+    return np.moveaxis(readings, 2, 0)
+
+
+def _fill_si(readings: Array, recording: Recording, elements: Elements, rows: slice) -> None:
+    """Fill `readings`, shape (axes, n, m), with those of some rows, rad/s."""
+    columns = dict(recording.columns)  # which gives back the memory of columns on disk below, for all at once
     for a, (row, unit) in enumerate(zip(elements.names, elements.units, strict=True)):
         for i, name in enumerate(row):
             np.multiply(columns[name][rows], to_si(1.0, unit), out=readings[a, i])
     release(*columns.values())
-    return np.moveaxis(readings, 2, 0)
 
 
 def _check_readings(recording: Recording, elements: Elements) -> Checks:
@@ -333,9 +338,9 @@ def _allan_covariance(
     starts = np.arange(0, m - 2 * size + 1, max(1, size // _OVERLAP))
     covariance = np.zeros((len(elements.axes), n, n))
     for part in np.array_split(starts, -(-m // max(ROWS_AT_ONCE, 4 * size))):
-        readings = _readings_si(still, elements, slice(part[0], part[-1] + 2 * size))
-        total = np.zeros((len(elements.axes), n, len(readings) + 1))
-        total[:, :, 1:] = np.moveaxis(readings, 0, 2)  # those of each gyro lie together
+        rows = slice(int(part[0]), int(part[-1]) + 2 * size)
+        total = np.zeros((len(elements.axes), n, rows.stop - rows.start + 1))
+        _fill_si(total[:, :, 1:], still, elements, rows)
         for a, i in np.ndindex(rest.bias.shape):
             integrate(total[a, i, 1:], float(rest.bias[a, i]))
         its = part - part[0]
