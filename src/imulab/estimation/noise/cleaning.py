@@ -93,9 +93,11 @@ def spikes_removed(samples: Array, ordered: Array) -> tuple[Array, int]:
     for start in range(0, blocks - 1, _CHUNK // _BLOCK):
         stop = min(start + _CHUNK // _BLOCK, blocks - 1)
         part = samples[body][start * _BLOCK : stop * _BLOCK]
-        some = np.arange(0, len(part), max(1, len(part) // 8192))
-        block, place = start + some // _BLOCK, some % _BLOCK
-        limit = _SPIKE / _TO_SIGMA * quantile(np.abs(part[some] - (level[block] + rise[block] * share[place])), 0.95)
+        every = max(1, len(part) // 8192)
+        some = np.arange(0, len(part), every)
+        block = some // _BLOCK
+        near = level[start:stop][block] + rise[start:stop][block] * share[some - _BLOCK * block]
+        limit = _SPIKE / _TO_SIGMA * quantile(np.abs(part[::every] - near), 0.95)
         if limit > 0 and float(reach[start:stop].max()) > limit:
             line = (level[start:stop, None] + rise[start:stop, None] * share).ravel()
             far = np.flatnonzero(np.abs(part - line) > limit)

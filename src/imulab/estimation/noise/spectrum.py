@@ -173,20 +173,33 @@ def cosine_coefficients(samples: Array, most: int | None = None) -> Array:
 
 
 def _turned(samples: Array, most: int | None = None) -> NDArray[np.complex128]:
-    """Return ``sqrt(n/2) (c_j - i c_{n-j})`` of samples of shape (..., n), j = 0 .. n // 2, or up to `most`."""
-    n = samples.shape[-1]
-    # The Fourier transform of the even samples, then the odd ones backwards, turned, is the cosine transform.
-    ordered = np.concatenate([samples[..., ::2], samples[..., 1::2][..., ::-1]], axis=-1)
-    ordered -= samples.mean(axis=-1, keepdims=True)
+    """Return ``sqrt(n/2) (c_j - i c_{n-j})`` of samples of shape (n,), j = 0 .. n // 2, or up to `most`."""
+    n = len(samples)
+    ordered = np.empty(n)
+    _fill_ordered(ordered, samples)
     turned = np.fft.rfft(ordered)
     del ordered
-    low = turned if most is None else turned[..., : most + 1]
-    count = low.shape[-1]
+    low = turned if most is None else turned[: most + 1]
+    low *= _turns(n, len(low))
+    return low
+
+
+def _fill_ordered(ordered: Array, samples: Array) -> None:
+    """Fill `ordered` with samples less their mean, both of shape (n,): the even ones, then the odd ones backwards.
+
+    The Fourier transform of these, turned, is the cosine transform.
+    """
+    mean, even = samples.mean(), (len(samples) + 1) // 2
+    np.subtract(samples[::2], mean, out=ordered[:even])
+    np.subtract(samples[1::2][::-1], mean, out=ordered[even:])
+
+
+def _turns(n: int, count: int) -> NDArray[np.complex128]:
+    """Return ``exp(-i pi j/(2 n))``, j = 0 .. count - 1, shape (count,)."""
     # Each angle is the sum of a coarse and a fine one, which needs a thousandth of the exponentials.
     fine, coarse = np.arange(_FINE), _FINE * np.arange(count // _FINE + 1)
     turn = np.multiply.outer(np.exp(-0.5j * np.pi / n * coarse), np.exp(-0.5j * np.pi / n * fine))
-    low *= turn.ravel()[:count]
-    return low
+    return np.asarray(turn.ravel()[:count])
 
 
 class Accumulator:
@@ -214,7 +227,7 @@ class Accumulator:
         self._interval, self._despike, self._long = interval, despike, long
         self._waiting = np.empty(0)
         self._held = self._spikes = self._stretches = 0
-        self._squares = np.zeros(1)
+        self._squares, self._turns = np.zeros(1), np.empty(0, dtype=np.complex128)
         self._knocks: list[NDArray[np.int64]] = []
         self._means, self._filled, self._averaged = np.empty(0), 0, 1
 
@@ -289,18 +302,23 @@ class Accumulator:
         return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes, self._knocked())
 
     def _transform(self, samples: Array) -> Array:
-        """Add the squares of all whole stretches, some at a time since they share their sines; return the rest."""
+        """Add the squares of all whole stretches, some at a time; return the rest."""
         while many := min(len(samples) // STRETCH, _TOGETHER):
-            stretches = np.empty((many, STRETCH))
-            for stretch, part in zip(stretches, samples[: stretches.size].reshape(stretches.shape), strict=True):
-                stretch[:] = self._cleaned(part)
+            ordered = np.empty((many, STRETCH))
+            for row, part in zip(ordered, samples[: ordered.size].reshape(ordered.shape), strict=True):
+                stretch = self._cleaned(part)
+                _fill_ordered(row, stretch)
                 self._add_means(stretch)
                 self._stretches += 1
-            squares = _turned(stretches).view(np.float64)
+            if not len(self._turns):
+                self._turns = _turns(STRETCH, STRETCH // 2 + 1)
+            turned = np.fft.rfft(ordered)
+            turned *= self._turns
+            squares = turned.view(np.float64)
             squares *= squares
             squares[0] += self._squares
             self._squares = squares.sum(axis=0)
-            samples = samples[stretches.size :]
+            samples = samples[ordered.size :]
         return samples
 
     def _add_means(self, samples: Array) -> None:
