@@ -100,6 +100,12 @@ SCALE_CHANGE = Decision(
 SAMPLES_LOST = Decision(
     5e-4, "verdict", {"tumble gyro": 1}, "turns miss as they do where samples are lost (restricted likelihood ratio)"
 )
+GYROS_UNSETTLED = Decision(
+    1e-4, "verdict", {"tumble gyro": 1}, "the gyroscopes go on turning where the accelerometers are at rest (F-test)"
+)
+GYROS_LOW_PASSED = Decision(
+    1e-4, "verdict", {"tumble gyro": 1}, "turns are smeared as by a low-pass filter of the gyroscopes (F-test)"
+)
 CLOCKS_DISAGREE = Decision(
     0.00047, "verdict", {"tumble gyro": 1}, "the two triads' clocks differ by more than crystals do", limit=3.5
 )

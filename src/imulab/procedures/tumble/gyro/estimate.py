@@ -33,7 +33,14 @@ from imulab.estimation.least_squares import chi_square_limit, f_test, restricted
 from imulab.estimation.rows import median
 from imulab.procedures.tumble.gyro.rotation import weighted_turns
 from imulab.procedures.tumble.gyro.solve import TurnSolution
-from imulab.procedures.tumble.gyro.turns import body_rate, by_directions, directions_missed, misalignment, model
+from imulab.procedures.tumble.gyro.turns import (
+    body_rate,
+    by_directions,
+    directions_missed,
+    directions_smeared,
+    misalignment,
+    model,
+)
 from imulab.procedures.tumble.gyro.windows import mean_of_holds
 from imulab.recording import Array
 
@@ -112,6 +119,8 @@ class TurnEstimate(Struct, frozen=True):
         tau^2, rad^2.
     reading
         Half the change of the parameters from one reading between samples to the other, (p,).
+    smear
+        Change of the parameters with what is not known of a low-pass filter that was taken off, (p, k).
     linearity
         Whether what the turns miss depends on the rate; None where too few turns are left to tell.
     lost
@@ -129,16 +138,17 @@ class TurnEstimate(Struct, frozen=True):
     root: Array
     beyond: float
     reading: Array
+    smear: Array
     linearity: Nonlinearity | None = None
     lost: float = 0.0
     lost_most_likely: float = 0.0
     samples_lost: bool = False
 
     def common(self) -> Array:
-        """Return what sampling and losses, which all turns have alike, move the parameters by, (p, 2)."""
+        """Return what sampling, losses and a filter, which all turns have alike, move the parameters by, (p, 2 + k)."""
         loss = np.zeros(len(self.covariance))
         loss[:3] = self.lost
-        return np.column_stack([self.reading, loss])
+        return np.column_stack([self.reading, loss, self.smear])
 
     def total(self) -> Array:
         """Return the covariance with all that a recording has alike in all its turns, (p, p)."""
@@ -188,7 +198,9 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
     """
     segments, scale, size = solved.segments, solved.scale, solved.theta.size
     theta: Array = np.concatenate([solved.theta, np.zeros(12 - size)])
-    shell = TurnEstimate(solved, np.empty(0), np.empty(0), normals(segments.after), np.empty(0), 0.0, np.zeros(size))
+    shell = TurnEstimate(
+        solved, np.empty(0), np.empty(0), normals(segments.after), np.empty(0), 0.0, np.zeros(size), np.empty((size, 0))
+    )
     matrix: Array = np.empty(0)
     root: Array = np.empty(0)
     by_zero: Array = np.empty(0)
@@ -215,6 +227,7 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
         shell, solution=replace(solved, theta=theta, residual=left, jacobian=slopes[:, :size]), covariance=covariance,
         gain=gain, root=root, beyond=beyond, reading=gain @ shell.project(moved[:, None])[:, 0],
     )  # fmt: skip
+    estimate = replace(estimate, smear=_smear(estimate))
     columns, largest = rate_columns(estimate)
     estimate = replace(estimate, linearity=test_linearity(estimate, columns, largest))
     estimate, covariance = _with_losses(estimate, matrix, columns, by_zero)
@@ -223,6 +236,20 @@ def estimate_turns(solved: TurnSolution, directions: Array, zero: Array | None) 
         lossy = replace(estimate, root=np.asarray(np.linalg.cholesky(covariance), dtype=np.float64))
         estimate = replace(estimate, linearity=test_linearity(lossy, columns, largest))
     return estimate
+
+
+def _smear(estimate: TurnEstimate) -> Array:
+    """Return by how much the parameters move with one standard uncertainty of each part of a filter, (p, k)."""
+    solved, readings = estimate.solution, estimate.solution.readings
+    if not any(readings.case.smear):
+        return np.empty((len(estimate.covariance), 0))
+    derivatives = readings.derivatives[:, solved.kept]
+    columns = estimate.project(directions_smeared(solved.segments, derivatives, solved.scale, solved.theta))
+    white = np.linalg.solve(estimate.root, np.column_stack([estimate.project(solved.jacobian), columns]))
+    design, added = white[:, : -columns.shape[1]], white[:, -columns.shape[1] :]
+    across = added - design @ np.linalg.lstsq(design, added, rcond=None)[0]
+    # across = Q R: one standard uncertainty along each direction is a column of the inverse of R.
+    return np.asarray(estimate.gain @ columns @ np.linalg.inv(np.linalg.qr(across)[1]))
 
 
 def normals(directions: Array) -> Array:

@@ -35,6 +35,7 @@ from imulab.procedures.tumble import CLOCKS, SENSITIVITIES
 from imulab.procedures.tumble.attitudes import Attitudes, find_attitudes, without_single_gaps
 from imulab.procedures.tumble.device import specific_force
 from imulab.procedures.tumble.gyro.estimate import Nonlinearity, TurnEstimate, estimate_turns
+from imulab.procedures.tumble.gyro.lowpass import without_filter
 from imulab.procedures.tumble.gyro.rest import clock_notes, direction_covariance, find_holds
 from imulab.procedures.tumble.gyro.solve import (
     CRYSTAL,
@@ -183,6 +184,7 @@ def fit_gyro_triad(
     alike = not apart or np.array_equal(time, accel_time)
     stamps = Stamps(time, time if alike else _on_accel_clock(case, time, sensitivity))
     case, solved = _solve_with_earth(case, stamps, sensitivity, earth)
+    case, solved, filter_notes = without_filter(case, stamps, sensitivity, solved)
     stamps, solved, stamp_notes = _with_even_stamps(case, stamps, sensitivity, solved)
     comparison = compare_clocks(
         accel_time, accel_force, stamps.time, solved.rate(output), solved.segments, search=apart
@@ -198,14 +200,14 @@ def fit_gyro_triad(
     notes = [
         *bridges,
         *(prefixed("gyro", note) for note in left_out.notes(_at_rest(attitudes, stamps.on_accel, left_out))),
+        *filter_notes,
         *stamp_notes,
         *noise_notes,
         *solved.notes,
         *_warn_foreign_record(record, attitudes, case.force),
         *known.notes(apart=apart),
     ]
-    if apart and clock_of == "gyro":
-        notes += _clock_notes(solved.readings)
+    notes += _clock_notes(solved.readings) if apart and clock_of == "gyro" else []
     # Each turn fixes two angles: gravity does not show a rotation about its own direction.
     freedom = max(2 * len(solved.segments.start) - solved.theta.size, 1)
     conditioning = _observability_of_turns(solved, freedom, recording.name)

@@ -143,8 +143,8 @@ class ScaleClock(Struct, frozen=True):
             return [
                 Note(
                     f"gyro: its samples come {1e3 * late:+.1f} ms after the accelerometers' of the same time (u "
-                    f"{1e3 * drift.delay_uncertainty:.1f} ms): harmless here, where turns go from hold to hold, not in "
-                    "a filter that uses both"
+                    f"{1e3 * drift.delay_uncertainty:.1f} ms): a delay does no harm here, where turns go from hold to "
+                    "hold, but in a filter that uses both"
                 )
             ]
         return []
@@ -293,6 +293,7 @@ _TOLERANCE = 1e-6  # of the parameters: turns miss by mrad, so that a step leave
 _REWEIGHTED = 6  # fits with bounded influence before turns are called out
 _TOO_MANY_OUT = 3  # one turn in so many
 _FEWEST_LEFT = 6  # degrees of freedom that the test of a turn must leave
+_LATER = 0.5  # lengths of a window by which one in the same hold is another
 
 
 class TurnProblem(Struct, frozen=True, dict=True):
@@ -312,6 +313,10 @@ class TurnProblem(Struct, frozen=True, dict=True):
     """Output by what is known of the Earth's rate in each attitude, shape (n, 3)."""
     vertical: Array | None = None
     """Output by the Earth's whole rate along up in each, shape (n, 3), where nobody knows which part of it is there."""
+    later: int = 0
+    """Windows by which turns end later than the accelerometers come to rest: a low-pass filter has settled then."""
+    smear: tuple[float, float] = (0.0, 0.0)
+    """Coefficients of the output's second and third derivative, s^2 and s^3, which are taken off the turns."""
 
     @cached_property
     def beyond(self) -> NDArray[np.bool_]:
@@ -359,7 +364,20 @@ class TurnReadings(Struct, frozen=True, dict=True):
     @cached_property
     def output(self) -> Readings:
         """The output in the pieces of the turns."""
-        return self.span.read(self.case.output)
+        readings = self.span.read(self.case.output)
+        if not any(self.case.smear):
+            return readings
+        taken_off = np.tensordot(self.case.smear, self.derivatives, 1)
+        return replace(readings, middle=readings.middle - taken_off)
+
+    @cached_property
+    def derivatives(self) -> Array:
+        """The second and the third derivative of the output there, by differences of samples, (2, m, n, 3)."""
+        step, output = median(np.diff(self.stamps.time)), self.case.output
+        second = np.zeros_like(output)
+        second[1:-1] = np.diff(output, 2, axis=0) / step**2
+        third = np.gradient(second, step, axis=0)
+        return np.stack([self.span.read(second).middle, self.span.read(third).middle])
 
     @cached_property
     def force(self) -> Readings:
@@ -397,11 +415,29 @@ class TurnReadings(Struct, frozen=True, dict=True):
     def within(self, rest: GyroRest) -> Segments:
         """Return the turns from each window to the next in a hold."""
         first, last, hold = neighbouring_pairs(self.ends)
+        return self._inside(first, last, hold, rest, (rest.moved * np.ones((len(self.case.force), 3)))[hold])
+
+    def after_arrival(self, rest: GyroRest) -> Segments | None:
+        """Return the turns from the first window of each hold to one that is later by its length, or at its end.
+
+        None where fewer than half of the holds have room for one.
+        """
+        first, last = self.ends.first, self.ends.last
+        start = np.minimum(first.start + first.length, last.start)
+        hold = np.flatnonzero(start - first.start > _LATER * first.length)
+        if 2 * len(hold) < len(start):
+            return None
+        return self._inside(first.part(hold), Windows(start[hold], first.length[hold]), hold, rest, 0.0)
+
+    def _inside(
+        self, first: Windows, last: Windows, hold: NDArray[np.intp], rest: GyroRest, moved: Array | float
+    ) -> Segments:
+        """Return the turns from windows to later ones of the same holds; `moved` is what each hold's zero differs."""
         output = self.case.output
         if rest.slope is not None:
             output = output - self.case.force_at(self.stamps.on_accel) @ rest.slope.T
         span = span_between(self.stamps, (first, last), hold)
-        read, zero = span.read(output), rest.zero + (rest.moved * np.ones((len(self.case.force), 3)))[hold]
+        read, zero = span.read(output), (rest.zero + moved) * np.ones((len(hold), 3))
         up = self.case.up(first, hold), self.case.up(last, hold)
         return span.segments(read.middle - zero[:, None, :], read.half, up)
 
@@ -416,6 +452,10 @@ def read_turns(case: TurnProblem, stamps: Stamps, *, rough: bool = False) -> Tur
     holds = find_holds(case.attitudes, stamps.time if rough else stamps.on_accel, case.output, case.smallest, case.name)
     step = median(np.diff(case.own))
     ends = hold_ends(case.attitudes.start, case.attitudes.stop, step)
+    if case.later:
+        start = np.minimum(ends.first.start + case.later * ends.first.length, ends.last.start) + step / 2
+        ends = hold_ends(start, case.attitudes.stop, step)
+        holds = replace(holds, start=np.searchsorted(stamps.on_accel, start))
     if rough:
         middle = Windows((case.attitudes.start + case.attitudes.stop) / 2, np.full(len(case.force), step))
         ends = replace(ends, first=middle, last=middle)

@@ -27,6 +27,7 @@ _AROUND = 0.1  # s: by as much segmentation may see a turn later, or end it earl
 _GAP_SECONDS, _GAP_STEPS, _GAP_BURSTS = 0.05, 4.5, 2.0
 _FEW_BROKEN = 0.1  # of the turns: the others are as good without them
 _COARSE = 8  # pieces of steps taken as one where a scale factor is only to be found roughly
+_STEP = 1e-9  # s^2, s^3: of a numerical derivative
 _START_FACTORS = np.geomspace(0.4, 1.25, 24)
 
 
@@ -227,6 +228,16 @@ def directions_missed(segments: Segments, scale: Array, theta: Array) -> Array:
     """Return the carried less the found direction of each turn, shape (3 m,)."""
     missed: Array = np.einsum("mij,mj->mi", carried(segments, scale, theta), segments.before) - segments.after
     return missed.ravel()
+
+
+def directions_smeared(segments: Segments, derivatives: Array, scale: Array, theta: Array) -> Array:
+    """Return the derivatives of the residuals by what is added of derivatives of the output, (k, m, n, 3); (3 m, k)."""
+    missed = directions_missed(segments, scale, theta)
+    columns = [
+        directions_missed(replace(segments, output=segments.output + _STEP * each), scale, theta) - missed
+        for each in derivatives
+    ]
+    return np.column_stack(columns) / _STEP
 
 
 def body_rate(segments: Segments, scale: Array, theta: Array) -> Array:
