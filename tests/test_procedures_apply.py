@@ -11,7 +11,7 @@ import imulab as il
 import madeup
 from imulab.cli import main
 from imulab.device.unit import load_blob
-from imulab.display import Note
+from imulab.display import Note, Verdict
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.procedures.apply import apply, apply_blocks, loaded, warn_before_applying, warn_of_unit
 from imulab.recording import Recording
@@ -270,6 +270,25 @@ def test_a_record_of_another_unit_is_warned_of():
     other = replace(record(truth, 1, "g"), sensor={"serial": "SN41"})
     (message,) = warn_before_applying(other, recording(outputs, "g"))
     assert message == "flight.csv: serial SN42, but the record was made for SN41"
+
+
+def test_python_is_told_what_the_command_warns_of(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    truth, _, outputs = simulated(1, "g")
+    bad = Verdict("bad", ("the attitudes scatter",), ("measure again",))
+    made = replace(record(truth, 1, "g", **MADE), sensor={"serial": "SN41"}, verdict=bad)
+    warm = recording(outputs, "g", temperature=(np.full(len(outputs), 60.0), "degC"))
+    made.save("r.json")
+    write(warm, "flight.csv")
+    assert main(["apply", "r.json", "flight.csv", "-q", "-o", "out.csv"], project=False) == 0
+    lines = [line.removeprefix("imulab: warning: ") for line in capsys.readouterr().err.splitlines()]
+    assert [line[:30] for line in lines] == [
+        "the record's verdict is bad, d", "flight.csv: serial SN42, but t", "flight.csv: temperature 60.0 d"
+    ]  # fmt: skip
+    assert list(il.apply(made, warm).notes) == lines
+    assert list(made.apply(warm).notes) == lines
+    for block in apply_blocks([loaded(made)], [warm]):
+        assert block.notes == ()  # the command line says it once
 
 
 ACCEL = {f"accel_{axis}": np.array([10.0, -200.0, 3000.0]) for axis in "xyz"}

@@ -217,8 +217,9 @@ def apply(
 
     The result names the record and its SHA-256 in `corrected_by`, which its file will hold; of a blob these are its own
     and those of the records in it. A recording that the same record corrected before is refused, unless `again`. Its
-    `notes` say where the recording's file names other records that corrected it, whose errors are not known, and where
-    accelerometers are probably in another unit than stated.
+    `notes` say what the command warns of: a record whose verdict is *bad*, or of another unit or temperature, a triad
+    that is missing, accelerometers that are probably in another unit than stated, and other records that corrected the
+    recording's file, whose errors are not known.
 
     Parameters
     ----------
@@ -307,7 +308,8 @@ def apply(
     notes = corrected.notes
     if not isinstance(record, Loaded):  # the command line says it of the first block
         earlier = map(Note, list_earlier(recording))  # as it may have to be: a later fit is not doubted for it
-        notes = tuple(dict.fromkeys([*notes, *warn_of_unit(ready, recording), *earlier]))
+        doubts = [*warn_before_applying(record, recording), *warn_of_unit(ready, recording)]
+        notes = tuple(dict.fromkeys([*notes, *doubts, *earlier]))
     by = (*recording.corrected_by, *_name_corrections(ready, active))
     return replace(corrected, corrected_by=by, notes=notes)
 

@@ -449,7 +449,8 @@ class Calibration:
         """Return data corrected by the record: a file, a recording, a data frame or arrays; see `imulab.apply`.
 
         Of a data frame this is a frame of the same library and index, with titles ``name [unit]`` and its columns of
-        texts; of all else a `Recording`.
+        texts; of all else a `Recording`. A frame has no `notes`: `imulab.apply` returns a recording, whose `notes` hold
+        what is to be doubted.
         """
         return views().apply_to(
             self, data, reading, again=again, heading=heading, latest_start=latest_start,
