@@ -586,3 +586,54 @@ def test_counts_stated_as_g_are_asked_for_their_unit():
     counts = log.with_columns({name: 16384 / G * log.column(name) for name in AXES}, dict.fromkeys(AXES, "g"))
     (said,) = warn_of_unit(loaded(made), counts)
     assert "g, more than any accelerometer reads, as counts would be; is their unit, g, right?" in said
+
+
+GYROS = ("gyro_x", "gyro_y", "gyro_z")
+
+
+@pytest.fixture(scope="module")
+def turned_by_hand():
+    """A recording with both triads, gyroscopes in deg/s, and its record."""
+    log = il.simulate_tumble(gravity=9.81, order=1, attitudes=12, seed=3)
+    log = log.with_columns({name: np.degrees(log.si(name)) for name in GYROS}, dict.fromkeys(GYROS, "deg/s"))
+    log = Recording({name: log.column(name) for name in ("time", *AXES, *GYROS)}, log.units, name="f.csv")
+    return log, il.fit_gyro(il.fit_tumble(log, order=1, gravity=9.81).calibration, log).calibration
+
+
+@pytest.mark.parametrize("stated", ["rad/s", "deg/h"])
+def test_gyroscopes_that_turn_as_gravity_in_another_unit_are_warned_of(
+    stated, turned_by_hand, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    log, made = turned_by_hand
+    wrong = log.with_columns({}, dict.fromkeys(GYROS, stated))
+    (note,) = il.apply(made, wrong).notes
+    assert note == (
+        f"gyro_x .. gyro_z: gravity turns in the accelerometers as by rates in deg/s; is their unit, {stated}, right? "
+        "--unit gyro=deg/s states another"
+    )
+    made.save("r.json")
+    write(wrong, "f.csv")
+    assert main(["apply", "r.json", "f.csv", "-q", "-o", "out.csv"], project=False) == 0
+    assert capsys.readouterr().err == f"imulab: warning: f.csv: {note}\n"
+    assert main(["apply", "r.json", "f.csv", "--unit", "gyro=deg/s", "-q", "-o", "out.csv"], project=False) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_the_unit_of_gyroscopes_is_not_asked_for_where_nothing_tells(turned_by_hand):
+    log, made = turned_by_hand
+    assert il.apply(made, log).notes == ()
+    radians = log.with_columns({name: log.si(name) for name in GYROS}, dict.fromkeys(GYROS, "rad/s"))
+    assert il.apply(made, radians).notes == ()
+    wrong = log.with_columns({}, dict.fromkeys(GYROS, "rad/s"))
+    still = replace(wrong, columns={name: wrong.column(name)[:200] for name in wrong.columns})
+    assert il.apply(made, still).notes == ()  # at rest
+    shaken = {name: wrong.column(name) + np.random.default_rng(1).normal(0, 30, len(wrong)) for name in AXES}
+    assert il.apply(made, wrong.with_columns(shaken, {})).notes == ()
+    gyros = Recording({name: wrong.column(name) for name in ("time", *GYROS)}, wrong.units, name="f.csv")
+    assert warn_of_unit(loaded(made), gyros) == []
+    # A record whose scale factors have the same wrong unit makes the rates right.
+    scaled = {
+        n: replace(p, value=57.29577951 * p.value) if "gyro_scale" in n else p for n, p in made.parameters.items()
+    }
+    assert warn_of_unit(loaded(replace(made, parameters=scaled)), wrong) == []

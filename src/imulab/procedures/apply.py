@@ -15,7 +15,7 @@ from imulab.device.tables import DeviceTable, Fusion
 from imulab.device.unit import Blob, DeviceUnit
 from imulab.display import SENTENCES, Note
 from imulab.errors import DataError, OptionError, RecordError, listed
-from imulab.estimation.likely_unit import doubt_by_correction
+from imulab.estimation.likely_unit import MOST_SAMPLES, doubt_by_correction, doubt_rates
 from imulab.estimation.sampling import whole_where_shared
 from imulab.options import choice, measure
 from imulab.procedures.correction_order import (
@@ -414,13 +414,20 @@ def list_earlier(recording: Recording) -> list[str]:
 
 
 def warn_of_unit(ready: Loaded, recording: Recording) -> list[str]:
-    """Return a warning where accelerometers that a record corrects are probably in another unit than stated."""
-    parts = [each for each in ready.sections if each[0].triad == "accel"]
-    if not parts or not len(recording) or not all(name in recording for name in triad("accel")):
+    """Return warnings where sensors that a record corrects are probably in another unit than stated."""
+    sections = [each for each in select_sections(ready.sections, recording) if each[0].triad in ("accel", "gyro")]
+    if not sections or not len(recording) or not all(name in recording for name in triad("accel")):
         return []
-    (part, columns), *_ = parts
-    doubt = doubt_by_correction(recording, lambda scaled: part.apply(ready.unit, columns, scaled))
-    return [doubt] if doubt else []
+    doubts, (part, columns) = [], sections[0]
+    if part.triad == "accel":
+        doubts.append(doubt_by_correction(recording, lambda scaled: part.apply(ready.unit, columns, scaled)))
+    if sections[-1][0].triad == "gyro" and all(name in recording for name in triad("gyro")):
+        head = {name: values[:MOST_SAMPLES] for name, values in recording.columns.items()}
+        corrected = replace(recording, columns=head)
+        for each, its in sections:
+            corrected = each.apply(ready.unit, its, corrected)
+        doubts.append(doubt_rates(corrected))
+    return [doubt for doubt in doubts if doubt]
 
 
 def list_results(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:

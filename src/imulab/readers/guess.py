@@ -26,6 +26,7 @@ from msgspec.structs import replace
 
 from imulab.columns import KINDS, triad
 from imulab.errors import ReadError, file_name, first_of, quoted, readable
+from imulab.estimation.likely_unit import unit_by_turns
 from imulab.files import open_file
 from imulab.options import measure, parsed, text
 from imulab.quantities import parse_units
@@ -54,9 +55,6 @@ _FIELDS = {"uT": (15.0, 150.0), "gauss": (0.15, 1.5), "nT": (15e3, 150e3)}
 _FASTEST = 35.0  # rad/s: no angular rate of a test is beyond 2000 deg/s
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 _NAMED = 50  # score of a table whose sensor the file's name speaks of
-_TURNING = 20  # tenths of a second that may show a turn
-_AGREE = 0.6  # least correlation of the turns that rates and accelerometers show: 0.7 where a hand turns them
-_TWICE = 2.0  # times its unit's, which the factor of the rates may be off: pushes at a turn's ends shrink it to 0.7
 _TIME_OF_DAY = re.compile(r"\d?\d:\d\d:\d\d(?:\.\d+)?$")
 _DAY_AND_MONTH = re.compile(r"(\d\d?)[./-](\d\d?)[./-]\d{4} +\d?\d:\d\d")
 _ARROW = re.compile(r"[ \t]*(\d?\d:\d\d:\d\d(?:[.:]\d+)?) -> ?")
@@ -714,31 +712,10 @@ def _step(times: Array, unit: str) -> float | None:
 
 
 def _rate_unit(table: Table, accel: Sequence[int], gyro: Sequence[int], step: float) -> tuple[str, str]:
-    """Return the unit of rates in which they explain how gravity turns in the body, df/dt = -w x f.
-
-    The factor of the rates is that of least squares over all rows, f and w smoothed over a tenth of a second. These
-    units are 57 times apart or more, and half and twice them are no scales of counts, as those of mrad/s are: of 8,399
-    parts of eight real recordings, 2 s or longer, it told 2,036, all rightly.
-    """
-    f = np.column_stack([table.numbers(place) for place in accel])
-    w = np.column_stack([table.numbers(place) for place in gyro])
-    whole = np.isfinite(f).all(axis=1) & np.isfinite(w).all(axis=1)
-    lag = max(1, round(0.1 / step))
-    if len(f) < _TURNING * lag or not whole.all():
-        return "", ""
-    smooth = np.ones(lag) / lag
-    f, w = (np.column_stack([np.convolve(c, smooth, "valid") for c in columns.T]) for columns in (f, w))
-    w = w - np.median(w, axis=0)
-    change = (f[2 * lag :] - f[: -2 * lag]) / (2 * lag * step)
-    turned = -np.cross(w, f)[lag:-lag]
-    both, alone, seen = (float((a * b).sum()) for a, b in ((change, turned), (turned, turned), (change, change)))
-    if not alone or not seen or both / np.sqrt(alone * seen) < _AGREE:
-        return "", ""
-    factor = both / alone
-    for unit in ("rad/s", "deg/s", "mdeg/s"):
-        if 1 / _TWICE < factor / parse_unit(unit).factor < _TWICE:
-            return unit, f"no unit in the titles; turns of gravity in the accelerometers agree with {unit}"
-    return "", ""
+    """Return the unit of rates in which they explain how gravity turns in the body, and why."""
+    force, rate = (np.column_stack([table.numbers(place) for place in places]) for places in (accel, gyro))
+    unit = unit_by_turns(force, rate, step) if np.isfinite(force).all() and np.isfinite(rate).all() else ""
+    return unit, unit and f"no unit in the titles; turns of gravity in the accelerometers agree with {unit}"
 
 
 def _symbol_rate(titles: Iterable[Title]) -> bool:
