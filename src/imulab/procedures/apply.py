@@ -32,6 +32,7 @@ from imulab.procedures.result import Record, as_read, as_record
 from imulab.quantities import in_si
 from imulab.recording import Data, Reading, Recording, with_power_on_temperature
 from imulab.records.calibration import Calibration, warn_other_unit
+from imulab.records.sections import Quantity, read
 
 # The tables of a unit: the numbers of its records as the C core's structs, in the order of their application.
 
@@ -397,15 +398,17 @@ def warn_before_applying(record: Calibration | Blob, recording: Recording) -> li
         messages.append(Note(f"{recording.name}: no {missing} in it: its {there} alone are corrected"))
     for part, columns in parts:
         messages += part.remarks(columns, recording)
-    made = None if isinstance(record, Blob) else record.model.get("temperature")
+    stated = None if isinstance(record, Blob) else record.model.get("temperature")
     here = recording.mean_temperature()
-    if made is None or here is None or abs(here - made["value"]) <= _FAR_IN_TEMPERATURE:
+    if stated is None or here is None:
         return messages
-    return [
-        *messages,
-        f"{recording.name}: temperature {here:.1f} degC is {abs(here - made['value']):.0f} K away from the "
-        f"{made['value']:.1f} degC at which the record was made",
-    ]
+    made = read(Quantity, stated, "model.temperature").value
+    if abs(here - made) > _FAR_IN_TEMPERATURE:
+        messages.append(
+            f"{recording.name}: temperature {here:.1f} degC is {abs(here - made):.0f} K away from the {made:.1f} degC "
+            "at which the record was made"
+        )
+    return messages
 
 
 def list_earlier(recording: Recording) -> list[str]:

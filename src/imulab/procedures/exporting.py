@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any
@@ -161,17 +161,15 @@ def _device_numbers(device_id: int | str, mag_device_id: int | str) -> tuple[int
     return number, mag_number
 
 
-def _without_effect(to: str, given: Sequence[str], records: Sequence[Calibration]) -> list[str]:
-    """Return a sentence on each option that has no effect."""
+def _without_effect(to: str, given: Sequence[str], records: Sequence[Calibration]) -> Iterator[str]:
+    """Yield a sentence on each option that has no effect."""
     parameters = {name for record in records for name in record.parameters}
     with_mag = any(name.startswith("mag_") for name in parameters)
-    lines = []
     for name in given:
         if to not in _TAKEN_BY[name]:
-            lines.append(f"{to}: --{name.replace('_', '-')} has no effect: it is for {' and '.join(_TAKEN_BY[name])}")
+            yield f"{to}: --{name.replace('_', '-')} has no effect: it is for {' and '.join(_TAKEN_BY[name])}"
         elif name.startswith("mag_") and not with_mag:
-            lines.append(f"{to}: --{name.replace('_', '-')} has no effect: the record holds no magnetometers")
-    return lines
+            yield f"{to}: --{name.replace('_', '-')} has no effect: the record holds no magnetometers"
 
 
 def _choose_fusions(to: str, stated: Mapping[str, Any], records: Sequence[Calibration]) -> list[Fusion | None]:
