@@ -246,9 +246,10 @@ def read_title(title: str, unit: str = "") -> Title:
     """Return what a title says; `unit` is that of a units row, which goes before the title's own."""
     rest, stated = _split_unit(title.strip().lstrip("#").strip())
     words = [word.lower() for word in _WORD.findall(rest)]
+    last = "".join(words[-1:])
     axis, words = _axis(words)
     if not (stated or unit):
-        words, stated = _unit_of_words(words)
+        words, stated = _unit_of_words(words, last)
     symbol = known_unit(unit) or stated
     if symbol == "g" and rest != title.strip() and title.rstrip().endswith(("(G)", "[G]")) and "mag" in title.lower():
         symbol = "gauss"
@@ -288,11 +289,11 @@ def _axis(words: list[str]) -> tuple[int | None, list[str]]:
     return None, words
 
 
-def _unit_of_words(words: list[str]) -> tuple[list[str], str]:
-    """Return words without those at their end that are a unit, and the unit."""
+def _unit_of_words(words: list[str], last: str) -> tuple[list[str], str]:
+    """Return words without those at their end that are a unit, and the unit; a lone letter is one behind the axis."""
     for count in (3, 2, 1):
         ending = "".join(words[-count:])
-        if len(words) >= count and ending in _ENDINGS and (len(words) > count or len(ending) > 1):
+        if len(words) >= count and ending in _ENDINGS and (len(ending) > 1 or (len(words) > count and ending == last)):
             kept = words if ending in ("adc", "seconds", "millis", "micros", "nanos") else words[:-count]
             return kept, _ENDINGS[ending]
     return words, ""
