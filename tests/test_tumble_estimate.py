@@ -235,6 +235,25 @@ def test_reversed_gyroscopes_and_left_handed_units_are_found(reverse):
         il.fit_tumble(il.find_attitudes(recording), order=1, gravity=G)
 
 
+@pytest.mark.parametrize(
+    ("taken", "said"),
+    [
+        ({"gyro_y": "-gyro_y"}, "gyroscope columns taken as x -y z"),
+        ({"gyro_x": "gyro_y", "gyro_y": "gyro_x"}, "gyroscope columns taken as y x z"),
+        ({"gyro_x": "gyro_y", "gyro_y": "gyro_z", "gyro_z": "-gyro_x"}, "gyroscope columns taken as -z x y"),
+        ({"accel_z": "-accel_z"}, "accelerometer columns taken as x y -z"),
+    ],
+)
+def test_the_sensor_whose_axes_are_swapped_or_reversed_is_named(taken, said):
+    recording = il.simulate_tumble(order=1, seed=4, attitudes=12, hold=2.0)
+    changed = {
+        name: -recording.column(source[1:]) if source.startswith("-") else recording.column(source)
+        for name, source in taken.items()
+    }
+    with pytest.raises(DataError, match=f"deg with the {said}$"):
+        il.fit_tumble(il.find_attitudes(recording.with_columns(changed, {})), order=1, gravity=G)
+
+
 @pytest.mark.slow
 def test_ten_thousand_attitudes_choose_their_order_in_linear_memory():
     rng = np.random.default_rng(11)

@@ -178,19 +178,21 @@ def check_axes(attitudes: Attitudes, force: Array) -> None:
     if not _median_miss(turn, before, after) > _WRONG:
         return
     mirrored = turns(-1.0)
-    miss = {name: _median_miss(turn, before @ m.T, after @ m.T) for name, m in _signed_permutations().items()}
-    miss |= {
-        f"{name} and the gyroscopes all reversed": _median_miss(mirrored, before @ m.T, after @ m.T)
-        for name, m in _signed_permutations().items()
-    }
+    miss = {}
+    for name, m in _signed_permutations().items():
+        miss[f"accelerometer columns taken as {name}"] = _median_miss(turn, before @ m.T, after @ m.T)
+        # With all gyroscopes reversed, accelerometers taken as m are gyroscopes taken as -det(m) m'.
+        axes = _axes_of(-np.linalg.det(m) * m.T)
+        gyros = "gyroscopes all reversed" if axes == "-x -y -z" else f"gyroscope columns taken as {axes}"
+        miss[gyros] = _median_miss(mirrored, before @ m.T, after @ m.T)
     # Reversing all three axes of gravity changes nothing: of two equals, the one with fewer reversals is meant.
     best = min(miss, key=lambda name: (round(miss[name], 9), name.count("-")))
     if miss[best] < _RIGHT:
+        as_named = miss["accelerometer columns taken as x y z"]
         raise DataError(
             f"{recording.name}: columns accel_x accel_y accel_z: axes swapped or reversed: between attitudes the "
-            f"direction of gravity misses the turn of gyro_x gyro_y gyro_z by {np.degrees(miss['x y z']):.0f} deg "
-            f"(median of {np.count_nonzero(short)} turns), but by {np.degrees(miss[best]):.1f} deg with the "
-            f"accelerometer columns taken as {best}"
+            f"direction of gravity misses the turn of gyro_x gyro_y gyro_z by {np.degrees(as_named):.0f} deg "
+            f"(median of {np.count_nonzero(short)} turns), but by {np.degrees(miss[best]):.1f} deg with the {best}"
         )
 
 
@@ -206,6 +208,10 @@ def _signed_permutations() -> dict[str, Array]:
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
             matrix[range(3), order] = signs
-            text = " ".join(("" if sign > 0 else "-") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True))
-            matrices[text] = matrix
+            matrices[_axes_of(matrix)] = matrix
     return matrices
+
+
+def _axes_of(matrix: Array) -> str:
+    """Return a signed permutation as text, ``y x -z``: which axis each row takes."""
+    return " ".join(("-" if row.sum() < 0 else "") + "xyz"[np.argmax(np.abs(row))] for row in matrix)
