@@ -800,6 +800,16 @@ def test_a_scatter_below_the_stated_noise_is_said():
         assert any("scatter less than their own noise" in each for each in warnings) == said
 
 
+def test_shaking_that_makes_the_noise_look_too_large_is_not_blamed_on_columns_that_are_not_there():
+    recording = il.simulate_tumble(order=1, seed=4, attitudes=16, hold=4.0)
+    shaking = 0.3 * np.sin(2 * np.pi * 1.75 * recording.time)
+    shaken = recording.with_columns({f"accel_{a}": recording.column(f"accel_{a}") + shaking for a in "xyz"}, {})
+    found = il.fit_tumble(shaken, order=1, gravity=G_HOLD).calibration
+    assert any("scatter less than their own noise" in each for each in found.warnings)
+    assert any("something firm" in each for each in found.verdict.next)
+    assert not any("std_" in each for each in found.verdict.next)
+
+
 def test_samples_without_a_time_are_no_table_of_attitudes(imulab, tmp_path):
     """The next command that the refusal names leads to the fit of the recording with its time."""
     recording = il.simulate_tumble(gravity=9.81, attitudes=16, gyro=False)

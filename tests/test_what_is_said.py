@@ -435,3 +435,12 @@ def test_what_is_stated_with_its_unit_is_taken_at_any_size(imulab):
     ):
         assert imulab(*shlex.split(words)).returncode == 0, words
     assert il.plan_noise(white=0.3).needed > 0
+
+
+def test_a_row_without_any_reading_is_said_once_for_all_sensors():
+    recording = il.simulate_tumble(gravity=9.81, attitudes=16, order=1)
+    torn = {name: values.copy() for name, values in recording.columns.items()}
+    for name in torn.keys() - {"time"}:
+        torn[name][700] = np.nan
+    fit = il.fit_tumble(recording.with_columns(torn, {}), order=1, gravity=9.81, with_="gyro")
+    assert sum("bridged from their neighbours" in each for each in fit.calibration.warnings) == 1

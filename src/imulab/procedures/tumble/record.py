@@ -610,7 +610,9 @@ def _scatter_warnings(
                 "the attitudes scatter less than their own noise lets expect (reduced chi-square "
                 f"{chi_square / freedom:.3g}): that noise is overstated, and every uncertainty is about "
                 f"{np.sqrt(freedom / max(chi_square, 1e-12)):.2g} times too large",
-                "leave the stated noise out (columns std_*)",
+                "leave the stated noise out (columns std_*)"
+                if problem.motion is None
+                else "record again on something firm: shaking within the attitudes counts as their noise",
             )
         ]
     if not beyond_noise(problem, chi_square, freedom):

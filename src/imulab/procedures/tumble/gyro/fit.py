@@ -459,7 +459,7 @@ def with_gyro(record: Calibration, fit: GyroFit, recording: Recording, accelerom
         sources=tuple(sources.values()),
         fit={**record.fit, "gyro": entries(_summary(fit, freedom))},
         data={**record.data, "gyro": entries(residuals)},
-        warnings=(*(w for w in record.warnings if not w.startswith("gyro")), *_warnings(fit)),
+        warnings=tuple(dict.fromkeys((*(w for w in record.warnings if not w.startswith("gyro")), *_warnings(fit)))),
         verdict=UNJUDGED,
     )
 

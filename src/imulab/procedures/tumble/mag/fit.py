@@ -127,12 +127,16 @@ def make_mag_record(
             **{f"mag_{name}" if name == "loss" else name: value for name, value in options.items()},
         },
         data={**accel.data, "mag": entries(_fields_section(ready, joint, aside))},
-        warnings=(
-            *accel.warnings,
-            *ready.means.notes,
-            *ready.notes,
-            *_warn_fit(ready, joint, observability, aside, moved, options, heading[0]),
-            *_warn_stated_dip(parameters["dip"], options.get("dip")),
+        warnings=tuple(
+            dict.fromkeys(
+                (
+                    *accel.warnings,
+                    *ready.means.notes,
+                    *ready.notes,
+                    *_warn_fit(ready, joint, observability, aside, moved, options, heading[0]),
+                    *_warn_stated_dip(parameters["dip"], options.get("dip")),
+                )
+            )
         ),
         verdict=UNJUDGED,
     )
