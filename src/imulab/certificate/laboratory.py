@@ -206,7 +206,7 @@ procedure = "QP-ACC-01, issue 3"
 standards = ["IEEE Std 1293-2018"]
 deviations = "none"
 [traceability]
-statement = "Gravity is traceable to the SI by the measurement named below."
+statement = "Gravity is traceable to the SI by the measurement named among the standards used."
 [[equipment]]
 name = "Local gravity value"
 quantity = "gravity"
