@@ -160,7 +160,8 @@ def test_a_unit_that_cannot_be_is_asked_about():
             [-20, 0, 21.5],
             {},
             DataError,
-            "c2: power-on temperature 21.5 degC fits no calibration temperature within 1 K",
+            "c2: power-on temperature 21.5 degC fits no calibration temperature within 1 K; "
+            r"expected one of .* \(--temperatures names others, --tolerance takes more\)",
         ),
         ([-20, -20, 0], {}, DataError, "no power cycle at 20 degC among 3 files: every interval needs"),
         ([], {}, DataError, "no power cycles"),

@@ -583,7 +583,7 @@ def assign_temperatures(cycles: Sequence[Cycle], temperatures: Array, tolerance:
         if distance > tolerance + _NEARLY:
             raise DataError(
                 f"{cycle.name}: power-on temperature {cycle.temperature:g} degC fits no calibration temperature within "
-                f"{tolerance:g} K; expected one of {known} (--temperatures names others)"
+                f"{tolerance:g} K; expected one of {known} (--temperatures names others, --tolerance takes more)"
             )
     missing = [f"{temperatures[k]:g}" for k in range(len(temperatures)) if k not in group]
     if missing:
