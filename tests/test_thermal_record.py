@@ -86,6 +86,13 @@ def test_a_jump_of_the_outputs_within_a_recording_is_asked_about():
     assert any("within recordings |f| scatters by" in each for each in said)
 
 
+def test_laws_that_bend_more_than_three_temperatures_show_are_not_blamed_on_another_unit(tmp_path):
+    assert main(["thermal", "simulate", "--temperatures", "0,25,50", "-o", str(tmp_path)]) == 0
+    record = il.fit_thermal(sorted(tmp_path.glob("*.csv"))).calibration
+    assert any("do the laws bend more than so few temperatures show, or is a" in each for each in record.warnings)
+    assert record.verdict.next == ("record five temperatures or more, or state --degrees",)
+
+
 def test_temperatures_above_what_sensors_bear_are_asked_about(tmp_path, capsys):
     files = []
     for each in soaks(1, lambda outputs, t, _: (outputs, 1.8 * t + 32.0)):

@@ -135,12 +135,15 @@ def warn_disagreement(holds: Holds, problem: ThermalProblem, solution: ThermalSo
             )
         )
     if scattered:
+        bends = "" if many or apart else "do the laws bend more than so few temperatures show, or "
         messages.append(
             Finding(
                 f"{name}: within recordings |f| scatters by {1e6 * solution.excess:.0f} µg, of which noise explains "
-                f"{1e6 * noise:.0f} µg: is a recording of another unit, with axes swapped, or with a jump of its "
-                f"outputs?{'' if differ else apart}",
-                "leave out the recording that is of another unit, or record it again",
+                f"{1e6 * noise:.0f} µg: {bends}is a recording of another unit, with axes swapped, or with a jump of "
+                f"its outputs?{'' if differ else apart}",
+                "record five temperatures or more, or state --degrees"
+                if bends
+                else "leave out the recording that is of another unit, or record it again",
             )
         )
     if not apart:
