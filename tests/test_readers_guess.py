@@ -415,3 +415,12 @@ def test_a_rate_that_no_sensor_has_is_refused(tmp_path, rate):
     (tmp_path / "a.csv").write_text("a_x,a_y,a_z\n1,2,3\n2,3,4\n1,1,1\n", encoding="utf-8")
     with pytest.raises(ReadError, match=r"a\.csv: sample_rate: expected a number of Hz from"):
         il.guess_layout(tmp_path / "a.csv", units={"accel": "g"}, sample_rate=rate)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("", "the file is empty"), ("\n \n", "the file is empty"), ("# a\n", "only comments; expected")]
+)
+def test_a_file_without_titles_is_said_to_have_none(tmp_path, text, said):
+    (tmp_path / "f.csv").write_text(text)
+    with pytest.raises(guess.GuessError, match=f"f.csv: {said}"):
+        il.guess_layout(tmp_path / "f.csv")
