@@ -359,7 +359,7 @@ def report(
     print(f"report: {output}")
 
 
-def demo(folder: Annotated[str, Argument("[DIR]", "Folder to write to.")] = "demo") -> None:
+def demo(folder: Annotated[str, Argument("[DIR]", "Folder to write to; demo if not given.")] = "demo") -> None:
     """Run five procedures and a fleet on simulated instruments.
 
     Writes recordings, records, corrected data, reports, and a page that shows them.
