@@ -206,6 +206,7 @@ def test_a_wrong_unit_or_sample_rate_is_no_result(options, words):
     _, record, attitudes, recording = campaign(4, **options)
     both = with_gyro(record, fit_gyro_triad(record, attitudes, recording), recording, recording)
     (warning,) = [w for w in both.warnings if words in w]
+    assert "e+" not in warning
     assert isinstance(warning, Bad)
     assert both.verdict.state == "bad"
 

@@ -310,7 +310,7 @@ def _warn_output_unit(parameters: Mapping[str, Parameter], unit: str) -> list[st
     off = {n[-1]: p.value * nominal.factor - 1 for n, p in parameters.items() if n.startswith("gyro_scale_factor")}
     if max(map(abs, off.values())) <= SCALE_OFF_UNIT:
         return []
-    offs = " ".join(f"{axis} {100 * value:+.3g} %" for axis, value in off.items())
+    offs = " ".join(f"{axis} {100 * value:+.1f} %" for axis, value in off.items())
     return [
         Bad(
             f"the scale factors are off by {offs}: is the unit ({unit}) right, or that of the table's rates?",

@@ -259,7 +259,7 @@ def _fit_scale_laws(turned: list[Turned], known: Array, over: Laws, notes: list[
         notes += _warn_constant(float(temperature.mean()), over, float(np.sqrt(np.diag(matrix)[:3].max())))
     middle = coefficients[: size : degree + 1] - 1
     if np.abs(middle).max() > SCALE_OFF_UNIT:
-        off = " ".join(f"{100 * value:+.3g}" for value in middle)
+        off = " ".join(f"{100 * value:+.1f}" for value in middle)
         notes.append(
             Bad(
                 f"gyro: the scale factors are off by {off} % (x y z): is the unit, or the sample rate, wrong?",

@@ -593,8 +593,9 @@ def _warn_scale_factors(fit: GyroFit) -> list[str]:
         return []
     ratio = fit.scale_factor * known.factor
     error = 100 * (ratio - 1)
-    listed = " ".join(f"{value:+.3g}" for value in error.tolist())
-    if np.abs(error).max() > 100 * SCALE_OFF_UNIT:
+    far = bool(np.abs(error).max() > 100 * SCALE_OFF_UNIT)
+    listed = " ".join(f"{value:+.1f}" if far else f"{value:+.3g}" for value in error.tolist())
+    if far:
         middle = float(np.exp(np.mean(np.log(np.abs(ratio)))))
         guess = next((f": {says}" for factor, says in _USUAL if abs(middle / factor - 1) < SCALE_OFF_UNIT), "")
         return [
