@@ -70,6 +70,14 @@ def test_repeats_that_cannot_be_undone_are_said():
     assert "3 % of the rows repeat the readings before" in own_readings(gyros(x[few]), ["gyro_x", "gyro_y"])[1][0]
 
 
+def test_noise_of_half_a_step_is_not_stuck_where_it_stays_on_its_level_by_chance():
+    """At the middle of a step two of three readings are the same: 31 in a row, once in 100 logs of this length."""
+    x = white(count=10_000)
+    x[:, 0] = 0.1 * np.round(0.52 * np.random.default_rng(125).normal(size=10_000))
+    assert np.diff(np.flatnonzero(np.diff(x[:, 0]))).max() > 30
+    assert not [note for note in own_readings(gyros(x), ["gyro_x"])[1] if "keeps one value" in note]
+
+
 @pytest.mark.parametrize("step", [0.0, 0.02, 0.1])
 def test_a_column_that_is_stuck_for_a_while_is_said(step):
     """100 s of 400 s of one gyroscope; steps of up to its noise, and the others are noisy meanwhile."""

@@ -477,6 +477,18 @@ _STUCK, _CHANGING = 50, 0.5  # samples of one value, while in others so many of 
 _COARSE = 1.5  # rows to a change; beyond, steps are as large as the noise, and staying on one is no fault
 
 
+def edges_of_runs(values: Array) -> NDArray[np.intp]:
+    """Return the rows at which runs of one value begin, and the number of rows last, shape (runs + 1,).
+
+    Examples
+    --------
+    >>> edges_of_runs(np.array([2.0, 2.0, 5.0])).tolist()
+    [0, 2, 3]
+    """
+    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+    return np.concatenate([[0], changes, [len(values)]])
+
+
 def stuck_run(values: Array, others: Sequence[Array], *, at_ends: bool = True) -> tuple[int, int] | None:
     """Return first row and length of the longest run of one value, if the column is stuck there while others change.
 
@@ -487,11 +499,10 @@ def stuck_run(values: Array, others: Sequence[Array], *, at_ends: bool = True) -
     at_ends
         Whether a run at the column's largest or smallest value counts, which in motion is the end of its range.
     """
-    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
-    edges = np.concatenate([[0], changes, [len(values)]])
+    edges = edges_of_runs(values)
     begin, end = edges[(longest := int(np.argmax(np.diff(edges)))) : longest + 2].tolist()
     length = end - begin
-    usual = (len(values) - length) / max(len(changes), 1)
+    usual = (len(values) - length) / max(len(edges) - 2, 1)
     if length <= _STUCK or usual > _COARSE or not others:
         return None
     if not at_ends and values[begin] in (values.min(), values.max()):
