@@ -588,6 +588,14 @@ def test_a_drift_over_time_is_named_and_is_no_asymmetry():
     assert abs(scale_factor.value - SCALE[2]) < 3 * scale_factor.standard_uncertainty
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_few_samples_in_steps_of_their_noise_are_not_saturated(seed):
+    """Of 25 samples of a dwell a fifth and more are often on the outermost step."""
+    made = recording(way=SEVEN, noise=0.05 * DEGREE, frequency=10.0, rng=np.random.default_rng(seed), column=False)
+    read = np.round(made.column("gyro_z") / DEGREE / 0.048) * 0.048 * DEGREE
+    assert il.fit_rate(changed(made, gyro_z=read), rates=np.array(SEVEN) * DEGREE).calibration.verdict.state != "bad"
+
+
 def test_steps_of_the_output_that_are_coarser_than_its_noise_are_in_the_uncertainties():
     """Steps of 0.25 deg/s and noise of a fifth of that: all visits of a rate are rounded alike."""
     errors = []

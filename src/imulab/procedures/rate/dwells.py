@@ -685,7 +685,9 @@ sweep passes at one output where that is saturated."""
 _NEXT_TO = 0.3  # of the gap between listed rates: a dwell that is nearer to one belongs to it
 _ALIKE, _OUT = 5e-3, 5.0
 """Visits of one rate differ at most by this share of the largest rate, or so many times their median difference."""
-_STANDS, _TIES = 0.2, 0.2  # of the usual scatter; of a dwell's samples at one limit: less, or more, is saturated
+_STANDS, _TIES, _MORE = 0.2, 0.2, 3.0
+"""A dwell is saturated that scatters by less than this share of what is usual; or of whose samples more than this share
+is at one limit, and more than on the step beside it by so many standard deviations."""
 _WRONG = 0.5  # of the largest span: where the axis that the manifest names spans less, another was turned
 _ROUNDING = 1e-9  # of the largest reading: smaller scatter is rounding
 _ROBUST = 0.6745 * np.sqrt(2)  # median of the absolute difference of two normal values, over their sigma
@@ -917,8 +919,10 @@ def _check_ends(
         noisy = usual > float(np.diff(values).min(initial=np.inf)) and counts.max() < (last - first) / 2
     for end in (int(np.argmax(reading)), int(np.argmin(reading))):
         a, b = stretches[end]
-        limit = output[a:b].max() if reading[end] > 0 else output[a:b].min()
-        if noisy and (spread[end] < _STANDS * usual or np.mean(output[a:b] == limit) > _TIES):
+        counts = np.append(0, np.unique(output[a:b], return_counts=True)[1][:: 1 if reading[end] > 0 else -1])
+        beside, at_limit = counts[-2:].tolist()  # of noise alone, fewer are at its end than beside it
+        piled = at_limit > _TIES * (b - a) and at_limit - beside > _MORE * np.sqrt(at_limit + beside)
+        if noisy and (spread[end] < _STANDS * usual or piled):
             raise DataError(
                 f"{place}: {main} stands still at {recording.column(main)[a:b].mean():.6g} {recording.units[main]} in "
                 f"the dwell at {recording.si('time')[a]:.1f} s: its output is saturated; expected rates in its range"
