@@ -10,8 +10,9 @@ import pytest
 
 import imulab as il
 from imulab.cli import main
-from imulab.procedures.rate.dwells import KERNELS, find_dwells, moments
+from imulab.procedures.rate.dwells import find_dwells
 from imulab.procedures.rate.schema import RateTest, Run
+from imulab.procedures.rate.sweeps import KERNELS, moments
 from reference.rate import DEGREE
 
 FREQUENCY, OVER = 200, 20
