@@ -12,6 +12,7 @@ import imulab as il
 from conftest import REPOSITORY, table
 from imulab.errors import RecordError
 from imulab.procedures.views import exhibits_of
+from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.report import render_page
 from imulab.report.traces import Exhibits, Figure, ReportTable, correlation_map, format_uncertain, log_axis, narrow
 from reference import tumble as reference
@@ -107,6 +108,12 @@ def test_a_record_without_the_data_for_its_figures_has_its_parameters_and_says_w
     assert "The record lacks data.attitudes: its parameters alone are shown; fit again for all figures." in page
     for name in record.parameters:
         assert f">{name}<" in page
+
+
+def test_names_keep_their_capitals_where_a_record_lacks_data():
+    value = Parameter(1e-6, 1e-9, "rad/s/(m/s^2)")
+    record = Calibration("centrifuge", {"x_K_1": value}, Covariance((), ()), {"order": 1}, {})
+    assert exhibits_of(record).headline.startswith("The record lacks x_K0, or the K of any level: its parameters")
 
 
 def test_a_record_with_something_else_in_place_of_the_data_for_its_figures_is_refused(record, tmp_path):

@@ -60,7 +60,7 @@ def exhibits_of(record: Calibration) -> Exhibits:
         if not str(error).startswith("the record lacks ") or not record.parameters:
             raise
         table = parameters_table(parameter_rows(record), "u is the standard uncertainty, – where none is stated.")
-        headline = f"{str(error).capitalize()}: its parameters alone are shown; fit again for all figures."
+        headline = f"T{str(error)[1:]}: its parameters alone are shown; fit again for all figures."
         return Exhibits(headline, [], [table])
     for procedure in joined_of(record):
         more = procedure.joined(record)
