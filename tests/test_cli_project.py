@@ -157,6 +157,7 @@ def test_verbose_says_which_one_was_used(work, capsys):
             "unknown key 'gravty'; known keys: gravity latitude height layout limits limit; did you mean 'gravity'?",
         ),
         ("gravity = \n", "the project file is not TOML: Invalid value (at line 1, column 11): 'gravity ='"),
+        ("# a\u2028b\ngravity = \n", "the project file is not TOML: Invalid value (at line 2, column 11): 'gravity ='"),
         ("gravity = true\n", "gravity = True: expected a text or a number, as --gravity takes it"),
         ("layout = 3\n", "layout = 3: expected the name of a file"),
         ('layout = "none.toml"\n', "layout = 'none.toml': no such file beside it"),

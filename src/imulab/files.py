@@ -218,7 +218,8 @@ def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
     import tomllib  # takes 3 ms to load, and most commands meet no such file
 
     text = _text(Path(path), name, what)
-    for number, line in enumerate(text.split("\n"), start=1):
+    lines = text.split("\n")  # which end nowhere else in TOML
+    for number, line in enumerate(lines, start=1):
         if line.count(".") > _MOST_DOTS and len(_DOT.findall(_NUMBER.sub("", line))) > _MOST_DOTS:
             raise ReadError(
                 f"{name}: line {number}: more than {_MOST_DOTS} dots in a line of the {what} file; expected keys of a "
@@ -229,7 +230,7 @@ def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         at = re.search(r"line (\d+)", str(error))
-        found = f": {quoted(text.splitlines()[int(at[1]) - 1].strip())}" if at else ""
+        found = f": {quoted(lines[int(at[1]) - 1].strip())}" if at else ""
         raise ReadError(f"{name}: the {what} file is not TOML: {error}{found}") from None
     except ValueError:  # Python reads no whole numbers of thousands of digits
         raise wide from None
