@@ -122,6 +122,8 @@ def test_rows_of_zeros_before_power_on_are_no_part_of_the_cycle():
     logged_before = a_cycle().with_columns(columns, {})
     with pytest.raises(DataError, match=r"c\.csv: row 1001, column time: every axis is zero before 20 s, as before"):
         find_power_cycle(logged_before)
+    with pytest.raises(DataError, match="every axis is zero before 20 s, as before"):
+        find_power_cycle(blocks_of(logged_before, 1000))  # of which the first has no other row
     assert find_power_cycle(logged_before, latest_start=30).first == pytest.approx(20.0)
 
 

@@ -230,7 +230,7 @@ def _check_rises(block: Recording, time: Array, last: float) -> None:
 def _first_reading_time(block: Recording, time: Array, row: int, latest_start: float) -> float:
     """Return the time of the first row that is not zero in all axes, s; refuse one that is too late."""
     first = float(time[row])
-    if row and first > latest_start:
+    if first > latest_start:
         raise DataError(
             f"{block.name}: {block.place(row)}, column time: every axis is zero before {first:.6g} s, as before "
             f"power comes on; expected readings from at most {latest_start:g} s on: leave those rows out and let time "
