@@ -391,6 +391,10 @@ REFUSED = {
     "no day": (LAB.replace("2026-11-20", '"last week"'), "certificate.received: "),
     "issued before": (LAB.replace("issued = 2026-11-27", "issued = 2026-11-23"), "out of order"),
     "received after": (LAB.replace("received = 2026-11-20", "received = 2026-11-25"), "received 2026-11-25, after"),
+    "one day of two": (
+        LAB.replace("[2026-11-24, 2026-11-24]", "[2026-11-24]"),
+        "performed: expected the first and the last day, such as [2026-11-24, 2026-11-25], found [2026-11-24]",
+    ),
     "infinite": (LAB.replace("23.0", "inf"), "conditions 1: value: expected a number, found inf"),
     "long unit": (
         LAB.replace('"degC"', f'"{"(" * 3000}m{")" * 3000}"'),

@@ -315,10 +315,12 @@ def issue_all(line, tmp_path, monkeypatch):
     """A function that certifies the fleet by a LAB.toml, and returns the exit status."""
     monkeypatch.chdir(tmp_path)
 
-    def run(number="EX-{serial}", days="[2026-03-01, 2026-03-31]", change=("x", "x"), options=()):
+    def run(
+        number="EX-{serial}", days="[2026-03-01, 2026-03-31]", change=("x", "x"), options=(), folder=line / "records"
+    ):
         lab = REVIEWED.replace("EX-2026-0042", number).replace("[2026-11-24, 2026-11-24]", days).replace(*change)
         Path("lab.toml").write_text(lab.replace("received = 2026-11-20\n", ""), encoding="utf-8")
-        return main(["fleet", "certificate", str(line / "records"), "--lab", "lab.toml", *options, "-o", "out"])
+        return main(["fleet", "certificate", str(folder), "--lab", "lab.toml", *options, "-o", "out"])
 
     return run
 
@@ -374,6 +376,20 @@ def test_what_is_wrong_for_every_unit_is_said_once_and_nothing_is_written(issue_
     assert expected in said.err
     assert (said.out, said.err.count("\n")) == ("", 1)
     assert not Path("out").exists()
+
+
+def test_the_day_of_issue_is_compared_with_the_latest_record(line, issue_all, tmp_path, capsys):
+    shutil.copytree(line / "records", tmp_path / "records")
+    record = il.load("records/LINE-0002.json")
+    replace(record, created="2099-01-02T00:00:00Z").save("records/LINE-0002.json")
+    assert issue_all(folder="records") == 2  # one has no record
+    assert ": before the record was made, on 2099-01-02; expected a later day" in capsys.readouterr().err
+
+
+def test_an_empty_folder_that_was_there_before_is_kept(issue_all):
+    Path("out").mkdir()
+    assert issue_all(change=("A. Example", "漢")) == 2
+    assert not list(Path("out").iterdir())
 
 
 @pytest.mark.parametrize(

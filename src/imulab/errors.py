@@ -24,7 +24,10 @@ def listed(known: Iterable[str], word: object) -> str:
 
 def quoted(value: object, longest: int = 60) -> str:
     """Return a value for a message, as Python writes it (a day as TOML does), cut if it is long."""
-    text = str(value) if hasattr(value, "isoformat") else repr(value)
+    if isinstance(value, list):
+        text = f"[{', '.join(quoted(each, longest) for each in value)}]"
+    else:
+        text = str(value) if hasattr(value, "isoformat") else repr(value)
     return text if len(text) <= longest else text[: longest - 3] + "..."
 
 

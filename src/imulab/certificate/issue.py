@@ -152,6 +152,7 @@ def write_fleet_certificates(
     _check_common(stated, limits, fonts, sign)
     if limits is not None:
         _check_limits(str(limits), fleet_status(folder))
+    new = not Path(output).exists()
     try:
         Path(output).mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -165,8 +166,9 @@ def write_fleet_certificates(
             _write(made, [Path(output) / f"{unit.serial}{ending}" for ending in (".xml", ".pdf")], lab, fonts, sign)
         except ImulabError as error:
             if str(error).startswith(f"{lab}: "):  # and so for every unit
-                with suppress(OSError):  # it was there before, and holds files
-                    Path(output).rmdir()
+                with suppress(OSError):  # it holds files of earlier units
+                    if new:
+                        Path(output).rmdir()
                 raise
             refused[unit.serial] = str(error)
         if progress is not None:

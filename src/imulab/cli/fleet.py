@@ -115,11 +115,12 @@ def certificate(
             folder, output, lab=lab, limits=limits, language=language, fonts=fonts, sign=sign, progress=update
         )
     print(f"certificates: {len(units) - len(refused)} in {output}")
-    certified = next((row.summary for row in units if row.summary and row.unit.serial not in refused), None)
-    if certified is not None:
-        tumbled = certified.procedure == "tumble"
-        remarks = template_remarks(lab, certified.parameters, tumbled=tumbled)
-        for remark in [*remarks, *day_remarks(lab, certified.created, datetime.now(UTC).date())]:
+    certified = [row.summary for row in units if row.summary and row.unit.serial not in refused]
+    if certified:
+        tumbled = certified[0].procedure == "tumble"
+        remarks = template_remarks(lab, certified[0].parameters, tumbled=tumbled)
+        latest = max(each.created for each in certified)
+        for remark in [*remarks, *day_remarks(lab, latest, datetime.now(UTC).date())]:
             warn(remark)
     if not refused:
         return 0
