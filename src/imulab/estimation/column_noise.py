@@ -25,11 +25,10 @@ from imulab.estimation.noise_coefficients import (
     fits,
     mean_uncertainty,
     read_coefficients,
-    resolution,
     undetermined,
     unseen,
 )
-from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out
+from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out, resolution
 from imulab.estimation.sampling import bridged, mend_stamps, sampling_rate, steady_part
 from imulab.recording import Array, Recording, check_not_resampled
 from imulab.units import from_si, parse_unit, si_unit, to_si

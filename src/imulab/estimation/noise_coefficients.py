@@ -345,12 +345,6 @@ def unseen(analysis: Analysis, coefficients: NoiseCoefficients, duration: float)
     return ratio if ratio > _MUCH else 1.0
 
 
-def resolution(samples: Array) -> float:
-    """Return the smallest step between different values of the first 20,000 samples, or 0 where all are the same."""
-    values = distinct(samples[:20_000])
-    return float(np.diff(values).min()) if len(values) > 1 else 0.0
-
-
 def coefficients_dict(coefficients: NoiseCoefficients, unit: str) -> dict[str, Any]:
     """Return the coefficients as plain JSON values with their units: null and the reason where not determined."""
     units = (f"{unit}/sqrt(Hz)", unit, f"{unit}/sqrt(s)", {"rad/s": "rad", "m/s^2": "m/s"}.get(unit, f"{unit} s"))

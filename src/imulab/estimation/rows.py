@@ -98,6 +98,12 @@ def distinct(values: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]])
 
 
+def resolution(samples: Array) -> float:
+    """Return the smallest step between different values of the first 20,000 samples, or 0 where all are the same."""
+    values = distinct(samples[:20_000])
+    return float(np.diff(values).min()) if len(values) > 1 else 0.0
+
+
 def rms(values: ArrayLike) -> float:
     """Return the root mean square of values.
 
@@ -408,7 +414,7 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     far, alone = np.zeros((2, len(x)), dtype=np.bool_)
     count = (len(x) - 1) // _AROUND
     local = np.empty(count)
-    resolution, largest = np.inf, []
+    finest, largest = np.inf, []
     for first, steps in _steps(x):
         largest.append(steps.max())
         parts = steps[: len(steps) // _AROUND * _AROUND].reshape(-1, _AROUND)
@@ -416,15 +422,15 @@ def _far_samples(x: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         smallest = float(steps.min())
         if not smallest > 0:
             smallest = float(np.min(steps, where=steps > 0, initial=np.inf))
-        resolution = min(resolution, smallest)
+        finest = min(finest, smallest)
     # Next to a motion there is no rest: the largest of a part's steps and its neighbours' counts.
     wide = local.copy()
     np.maximum(wide[:-1], local[1:], out=wide[:-1])
     np.maximum(wide[1:], local[:-1], out=wide[1:])
-    if resolution == np.inf:
+    if finest == np.inf:
         return far, alone
-    moving = wide > _QUIET * max(quantile(local, 0.2), resolution)
-    least = _GLITCH_SIGMAS * resolution
+    moving = wide > _QUIET * max(quantile(local, 0.2), finest)
+    least = _GLITCH_SIGMAS * finest
     limits = np.maximum(_GLITCH_SIGMAS * _TO_SIGMA * wide, least)
 
     def part(samples: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -17,8 +17,7 @@ from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.decisions import COLUMN_STUCK
 from imulab.estimation.likely_unit import STATE_UNIT, no_gravity
-from imulab.estimation.noise_coefficients import resolution
-from imulab.estimation.rows import deviation_of_steps, distinct, edges_of_runs, median
+from imulab.estimation.rows import deviation_of_steps, distinct, edges_of_runs, median, resolution
 from imulab.estimation.sampling import FEW
 from imulab.recording import Array, Recording, stored_as
 from imulab.units import to_si

@@ -20,8 +20,7 @@ from imulab.estimation.clock import read_clock
 from imulab.estimation.column_noise import most_reach, moved_columns
 from imulab.estimation.noise.readings import doubtful_units, dropouts, own_readings, takes_levels
 from imulab.estimation.noise.spectrum import Accumulator, Stretch, slow_coefficients, transformed
-from imulab.estimation.noise_coefficients import resolution
-from imulab.estimation.rows import deviation_of_steps, distinct
+from imulab.estimation.rows import deviation_of_steps, distinct, resolution
 from imulab.estimation.sampling import (
     BRIDGED,
     KILOHERTZ_IN_MS,

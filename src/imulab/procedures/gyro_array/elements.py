@@ -18,7 +18,7 @@ from imulab.columns import shared_unit
 from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.clock import GAP, read_clock
-from imulab.estimation.noise_coefficients import resolution
+from imulab.estimation.rows import resolution
 from imulab.estimation.sampling import mend_stamps, usual_step
 from imulab.procedures.gyro_array.schema import array_of
 from imulab.recording import Array, Recording, check_finite, check_time, joined

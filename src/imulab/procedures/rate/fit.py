@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.errors import DataError, ObservabilityError, OptionError, UnitError, listed
-from imulab.estimation.rows import distinct
+from imulab.estimation.rows import resolution
 from imulab.gravity import EARTH, checked_latitude
 from imulab.options import choice, measure, parsed
 from imulab.procedures.rate import AXES, MOUNTINGS, ORDERS, name_gyroscopes, parse_fraction, parse_rates
@@ -311,7 +311,7 @@ def _with_rounding(
         edges = np.searchsorted(recording.si("time"), np.column_stack([run_dwells.start, run_dwells.stop]))
         for i, name in enumerate(names):
             parts = [recording.column(name)[a:b] for a, b in edges.tolist()]
-            step = min(float(np.diff(distinct(part[:_OF_STEPS])).min(initial=np.inf)) for part in parts)
+            step = min(resolution(part[:_OF_STEPS]) or np.inf for part in parts)
             if np.median([part.std() for part in parts]) < step / 2 < np.inf:
                 largest[i] = max(largest[i], step / np.sqrt(12))
     return replace(problem, rounding=largest, variance=problem.variance + (0.01 * largest) ** 2)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import shared_unit
 from imulab.errors import DataError, UnitError
-from imulab.estimation.rows import distinct, median, medians, quantile
+from imulab.estimation.rows import median, medians, quantile, resolution
 from imulab.estimation.sampling import mend_blocks
 from imulab.recording import (
     LATEST_START,
@@ -191,7 +191,8 @@ def find_power_cycle(
             if not pieces:
                 first = _first_reading_time(block, time, int(np.argmin(here)), latest_start)
             pieces.append(_accumulate(block, axes, time, ~here if here.any() else None))
-            steps.append(np.array([_step(block.columns[axis]) for axis in axes]))
+            some = slice(None, None, 1 + len(time) // _OF_STEPS)
+            steps.append(np.array([resolution(block.columns[axis][some]) or np.inf for axis in axes]))
     if head is None:
         raise DataError("no samples")
     if not pieces:
@@ -237,11 +238,6 @@ def _first_reading_time(block: Recording, time: Array, row: int, latest_start: f
             "count from power-on (--latest-start allows more)"
         )
     return first
-
-
-def _step(values: Array) -> float:
-    """Return the smallest step between different values of some samples; infinite where all are the same."""
-    return float(np.diff(distinct(values[:: 1 + len(values) // _OF_STEPS])).min(initial=np.inf))
 
 
 def _check_length(block: Recording, first: float, last: float, rows: int, *, ended: bool = False) -> None:
