@@ -155,7 +155,7 @@ def test_a_certificate_of_a_board_says_what_its_size_rests_on(issue):
     replace(record, sensor={"serial": "B1"}).save("board.json")
     assert issue(REVIEWED, "board.json") == 0
     text = Path("cert.xml").read_text(encoding="utf-8")
-    assert "the mean scale factor of all gyroscopes, rest on its nominal value and the tolerance" in text
+    assert "the mean scale factor of all gyroscopes, rest on the nominal value of that mean and its tolerance" in text
     assert "Held near their nominal values, which the recording does not tell: size of the board" in text
 
 

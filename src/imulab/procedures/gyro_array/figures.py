@@ -309,12 +309,15 @@ def reservations(record: Calibration) -> list[str]:
     earth = "The Earth's rate, up to 15 deg/h along an axis, was not taken off: biases of gyroscopes hold it."
     if record.model.get("kind") == "imus":
         board = imus_of(record)
-        nominal = "Positions, and the mean scale factor of all gyroscopes, rest on its nominal value and the tolerance."
+        nominal = (
+            "Positions, and the mean scale factor of all gyroscopes, rest on the nominal value of that mean and its "
+            "tolerance."
+        )
         kept = f"Held near their nominal values, which the recording does not tell: {'; '.join(board.not_determined)}."
         return [earth, *[nominal] * (board.size_from == "gyro scale"), *[kept] * bool(board.not_determined)]
     relative = (
-        "Scale factors and alignment are relative to the mean of all elements, of which nothing was measured: no "
-        "uncertainty of theirs is that of a scale factor in rad/s."
+        "Scale factors and alignment are relative to the mean of all elements. The scale factor of that mean was not "
+        "measured: uncertainties do not hold its error."
     )
     gauge = record.model.get("gauge")
     said = [warning for warning in record.warnings if SLOWER_NOISE in warning]
