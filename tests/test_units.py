@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 
 from imulab.errors import OptionError, UnitError
 from imulab.quantities import parse_units
-from imulab.units import STANDARD_GRAVITY, conversion_factor, from_si, parse_scale_factor, parse_unit, si_unit, to_si
+from imulab.units import (
+    STANDARD_GRAVITY,
+    conversion_factor,
+    from_si,
+    likely_times,
+    parse_scale_factor,
+    parse_unit,
+    si_unit,
+    to_si,
+)
 
 # What one of each unit is in SI (SI brochure, 9th edition, tables 1, 4, 7 and 8; IAU: 1 arcsec = pi/648000 rad; gravity
 # 3rd CGPM 1901; 0 degC = 273.15 K). The digits of pi/180 and pi/648000 are OEIS A019685 and A209538.
@@ -251,3 +260,8 @@ def test_what_is_no_scale_factor_is_refused_with_an_example(text):
 )  # fmt: skip
 def test_values_in_si_have_the_si_unit_of_their_quantity(unit, expected):
     assert si_unit(unit) == expected
+
+
+def test_no_unit_of_time_is_proposed_that_is_the_stated_one_by_another_name():
+    assert likely_times("µs", 200.0, 20.0) == likely_times("us", 200.0, 20.0) == ""
+    assert likely_times("ms", 2e5, 0.06) == "200 Hz if it is in s"

@@ -567,7 +567,7 @@ LARGE = 1 << 28
 
 
 _AT_ONCE = 1 << 18  # rows of a column in a temporary file that are converted together
-_KEPT = (1 << 22) - (1 << 12)  # numbers, just below 32 MB: the most that the C library takes for a measure
+_KEPT = (1 << 22) - (1 << 12)  # numbers, just below 32 MB: of no larger block glibc learns how much to keep
 
 
 def is_large(file: str | PathLike[str] | None) -> bool:

@@ -269,7 +269,7 @@ def likely_times(unit: str, rate: float, duration: float) -> str:
         if (
             _LIKELY_RATES[0] <= rate / factor < _LIKELY_RATES[1]
             and _LIKELY_DURATIONS[0] <= duration * factor <= _LIKELY_DURATIONS[1]
-            and other != unit
+            and factor != 1.0  # the same unit, perhaps by another name
         ):
             likely.append(f"{rate / factor:.4g} Hz if it is in {other}")
     return " or ".join(likely)
