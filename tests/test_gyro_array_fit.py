@@ -306,6 +306,18 @@ def test_gyros_at_their_limits_together_are_no_repeated_rows():
     assert not any("exact repeats" in message for message in warnings)
 
 
+def test_a_false_reading_beyond_its_range_does_not_hide_that_a_gyro_is_at_its_end():
+    still, moving, _, _ = array_of(1, 1)
+    found = []
+    for wrong in (0.0, -300.0):
+        columns = {n: np.append(still.columns[n][:2000], np.clip(x, -105, 105)) for n, x in moving.columns.items()}
+        columns |= {"time": np.arange(14_000) / 100}
+        columns["gyro_5"][1000] += wrong  # which is at its lower end in rows in which no other is at one
+        warnings = calibrate_array(still, Recording(columns, moving.units, name="moving.csv")).calibration.warnings
+        found += [message for message in warnings if "at the end of a gyro's range" in message]
+    assert found[0] == found[1]
+
+
 @pytest.mark.parametrize("axes", [1, 3])
 @pytest.mark.parametrize(("factor", "text"), [
     (1.0, ""), (30.0, ""),

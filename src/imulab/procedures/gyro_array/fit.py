@@ -245,10 +245,11 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
     _refuse_stuck(moving, its, at_ends=False)  # those are at the end of their range
     clipped = _clipped_rows(_readings_si(moving, its))
     left_out = _bridge_rows(moving, its)
+    readings = _readings_si(left_out.recording, its)
+    clipped |= _clipped_rows(readings)  # of a range that a single false reading exceeds
     kinds = {kind: rows & ~clipped for kind, rows in left_out.kinds.items()}  # all at their limits repeat themselves
     left_out = LeftOut(left_out.recording, left_out.names, kinds)
     moving = left_out.recording
-    readings = _readings_si(moving, its)
     notes = [prefixed(moving.name, note) for note in moving.notes]
     notes += [prefixed(moving.name, note) for note in left_out.notes()]
     if clipped.any():
