@@ -11,7 +11,7 @@ from imulab.errors import DataError, ObservabilityError, RecordError, UnitError
 from imulab.procedures.gyro_array import elements, fit
 from imulab.procedures.gyro_array.alignment import align, nominal_orientation
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
+from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse
 from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
 from imulab.procedures.views import exhibits_of
 from imulab.recording import Recording
@@ -333,6 +333,22 @@ def test_a_recording_whose_unit_is_not_the_records_is_told_by_noise_and_biases(a
     said = [note for note in fused.notes if "in the record: another unit" in note]
     assert bool(said) == bool(text)
     assert all(re.search(rf"flight.csv: noise and biases of the gyros are {text}", note) for note in said)
+
+
+def test_another_unit_is_told_from_blocks_of_any_length():
+    still, moving, _, _ = array_of(1, 1)
+    options = FuseOptions(calibration=calibrate_array(still, moving).calibration)
+    radians = {name: x if name == "time" else np.radians(x) for name, x in moving.columns.items()}
+    said = []
+    for size in (12_000, 500):
+        fuser = Fuser(options)
+        blocks = (
+            Recording({n: x[i : i + size] for n, x in radians.items()}, moving.units, name="f.csv", first_row=i + 1)
+            for i in range(0, 12_000, size)
+        )
+        assert list(fuser.fuse(blocks))
+        said += [note for note in fuser.notes() if "another unit" in note]
+    assert said[0] == said[1]
 
 
 def test_turned_on_again_and_filtered_gyros_are_no_other_unit():

@@ -538,8 +538,7 @@ class Fuser:
     lost: int = 0
     other: list[str] = field(default_factory=list)
     held: ArrayCalibration | None = None
-    scale: list[str] = field(default_factory=list)
-    rows: int = 0
+    first: Array | None = None
 
     def fuse(self, blocks: Iterable[Recording]) -> Iterator[Fused]:
         """Yield the fused rates of consecutive blocks; the result does not depend on where they are cut.
@@ -575,9 +574,9 @@ class Fuser:
             self._drop_zeros(readings)
             if self.checks is not None:
                 self.checks.watch(readings)
-            if elements is not None and self.held is not None and not self.rows:
-                self.scale = warn_other_scale(self.held, readings[:_FOR_NOISE], self.clock.rate)
-            self.rows += len(readings)
+            if self.held is not None and (self.first is None or len(self.first) < _FOR_NOISE):
+                before_it = [] if self.first is None else [self.first]
+                self.first = np.concatenate([*before_it, readings])[:_FOR_NOISE]
             fused_before = 0
             if not settled:
                 early = np.concatenate([early, time])
@@ -605,7 +604,11 @@ class Fuser:
         lines = []
         if self.checks is not None:
             lines = self.checks.lines(turned=not self._aligns(), known=known)
-            lines += self.scale or warn_misaligned(self.checks, None if self.held is None else self.held.matrices)
+            if self.held is None or self.first is None:
+                lines += warn_misaligned(self.checks, None)
+            else:
+                scale = warn_other_scale(self.held, self.first, self.clock.rate)
+                lines += scale or warn_misaligned(self.checks, self.held.matrices)
         if self.lost:
             rows = f"{self.lost} row{'s' * (self.lost > 1)}"
             text = f"{rows} left out: every gyro is exactly zero; the output is nan there"
