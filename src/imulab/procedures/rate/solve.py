@@ -565,7 +565,7 @@ def _fit_drift(
     if time is None:
         return None
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
-    most = min(_POWERS, int(key.max()) - 1)
+    most = max(min(_POWERS, int(key.max()) - 1), 1)
     powers = np.column_stack([*(rate**power for power in range(1, most + 1)), zeros])
     return fit_drift(rate, values, variance, runs, time[on_axis], powers)
 

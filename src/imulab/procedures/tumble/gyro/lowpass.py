@@ -146,7 +146,7 @@ def explain_smear(solved: TurnSolution, kept: NDArray[np.bool_] | None = None) -
 
 def _explain(design: Array, columns: Array, values: Array, count: int) -> _Explained:
     """Return what columns beside a design explain of values, of which `count` are independent."""
-    length = np.linalg.norm(columns, axis=0)
+    length = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     whole = np.column_stack([design, columns / length])
     size, larger = design.shape[1], whole.shape[1]
     answer = np.linalg.lstsq(whole, values, rcond=None)[0]
