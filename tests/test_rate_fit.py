@@ -571,6 +571,19 @@ def test_a_rate_that_is_listed_wrong_is_to_be_looked_at_and_named():
     assert re.search(r"most at -?100 deg/s", said[0])
 
 
+def test_slow_noise_is_not_taken_for_a_rate_that_is_listed_wrong():
+    """A random walk of the zero, of ten times the noise of a dwell from one to the next: all dwells scatter alike."""
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        made = recording(way=SEVEN, noise=5e-5, column=False, rng=rng)
+        walk = np.cumsum(rng.normal(0, 4e-6, len(made)))
+        record = il.fit_rate(
+            changed(made, gyro_z=made.column("gyro_z") + SCALE[2] * walk), rates=np.array(SEVEN) * DEGREE,
+            table_uncertainty="1 ppm",
+        ).calibration  # fmt: skip
+        assert [type(w) for w in record.warnings if "may some of the table's be off" in w] in ([], [Note])
+
+
 def test_a_drift_over_time_is_named_and_is_no_asymmetry():
     """1000 ppm and 0.05 deg/s over the run: positive rates, which come first, differ from negative ones."""
     made = recording(way=SEVEN, noise=5e-5, rng=np.random.default_rng(3))

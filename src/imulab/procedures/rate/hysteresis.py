@@ -179,6 +179,20 @@ def _fit_each(covariances: Array, shapes: Array, values: Array) -> tuple[Array, 
     return value, 1 / np.sqrt(square), -roots[:, None] - np.log(square) / 2 - left / 2
 
 
+def test_one_rate(rate: Array, table: Array, values: Array, variance: Array, zeros: Array, worst: int) -> float:
+    """Return the probability that by chance the rate of dwell `worst` stands apart, as the others scatter (F-test).
+
+    A rate that is listed wrong stands apart from the line, either way round; a drift or slow noise scatters all dwells.
+    """
+    size = np.round(np.abs(table), 6)
+    there = size == size[worst]
+    ways = [way for way in (there & (rate >= 0), there & (rate < 0)) if way.any()]
+    line = np.column_stack([rate, zeros])
+    whole = np.column_stack([line, *ways])
+    before, after = (float(np.sum(fit_weighted(c, values, variance)[0] ** 2 / variance)) for c in (line, whole))
+    return min(len(np.unique(size)) * f_test(before, line.shape[1], after, whole.shape[1], len(rate)), 1.0)
+
+
 def test_visits(
     key: NDArray[Any], direction: NDArray[np.int64], zeros: Array, values: Array, variance: Array
 ) -> tuple[float, int] | None:

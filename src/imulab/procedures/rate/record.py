@@ -381,7 +381,8 @@ def _warn_line(
                 "fits powers all the same)"
             )
             action = f"compare the rates listed for {axis} with those that the table ran"
-            messages.append(Note(text) if line.nonlinearity[0] < known else Finding(text, action))
+            harmless = line.nonlinearity[0] < known or line.one_rate > LINE_BENDS.level
+            messages.append(Note(text) if harmless else Finding(text, action))
         if line.kink is not None:
             text = (
                 f"gyro_{axis}: the slopes of positive and negative rates differ by {1e6 * line.kink:+.3g} ppm, with a "

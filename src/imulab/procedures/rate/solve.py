@@ -45,6 +45,7 @@ from imulab.procedures.rate.hysteresis import (
     fit_hysteresis,
     fit_loop,
     fit_weighted,
+    test_one_rate,
     test_visits,
 )
 from imulab.procedures.rate.schema import RateTest
@@ -446,6 +447,8 @@ class Linearity:
         Slope of positive less slope of negative rates, ``(S+ - S-) / S``, and its standard uncertainty.
     probability
         Probability that noise alone leaves such residuals of the line.
+    one_rate
+        Probability that the rate with the largest residual stands apart from the others by chance, as they scatter.
     by_noise
         Limit that the largest residual stays below with 95 % by noise alone.
     loop
@@ -475,6 +478,7 @@ class Linearity:
     asymmetry: tuple[float, float] | None
     hysteresis: tuple[float, float] | None
     probability: float
+    one_rate: float
     by_noise: float
     loop: float | None
     fitted_loop: tuple[float, float] | None
@@ -499,11 +503,7 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
     of_rate = problem.rate_uncertainty[on_axis] ** 2 + (problem.rounded(gyro) / scale) ** 2
     zeros = (runs[:, None] == np.unique(runs)).astype(np.float64)
     largest = max(float(np.abs(rate).max()), 0.0 if problem.reach is None else float(problem.reach[on_axis].max()))
-    branch = (
-        np.zeros(len(rate), dtype=np.int64)
-        if problem.branch is None
-        else problem.branch[on_axis] * problem.sign[on_axis]
-    )
+    branch = np.zeros_like(runs) if problem.branch is None else problem.branch[on_axis] * problem.sign[on_axis]
     drift = None if branch.any() else _fit_drift(rate, values, variance, key, runs, problem.time, on_axis)
     values = values if drift is None else values - drift[0]
     left, _ = fit_weighted(np.column_stack([rate, zeros]), values, variance)
@@ -541,6 +541,9 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
         asymmetry=_fit_asymmetry(rate, values, scattered, zeros, direction, of_rate),
         hysteresis=hysteresis,
         probability=probability,
+        one_rate=test_one_rate(
+            rate, problem.table[on_axis], values, variance + of_rate, zeros, int(np.argmax(key == worst))
+        ),
         by_noise=reach * float(spread.max()) / largest,
         loop=loop,
         fitted_loop=fitted_loop,
