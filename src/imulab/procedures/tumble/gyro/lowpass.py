@@ -21,7 +21,6 @@ from __future__ import annotations
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from imulab.display import Finding, Note
 from imulab.estimation.decisions import GYROS_LOW_PASSED, GYROS_UNSETTLED
@@ -58,7 +57,7 @@ def without_filter(
         settling = explain_settling(solved)
     settled = settling is not None and settling.probability >= GYROS_UNSETTLED.level
     notes = _settling_notes(case.later, settled=settled or not case.later)
-    smear = explain_smear(solved)  # in all turns: those that it moves most may have been set aside
+    smear = explain_smear(solved)
     if smear.probability >= GYROS_LOW_PASSED.level:
         return case, solved, notes
     for _ in range(_ROUNDS):
@@ -68,7 +67,7 @@ def without_filter(
             break
         case = replace(case, smear=(second, third))
         solved = solve_turns(case, stamps, sensitivity)
-        smear = explain_smear(solved, solved.kept)
+        smear = explain_smear(solved)
         if (np.abs(smear.values) < _SETTLED * np.sqrt(np.diag(smear.covariance))).all():
             break
     return case, solved, [*notes, _smear_note(share)]
@@ -127,21 +126,23 @@ def explain_settling(solved: TurnSolution) -> _Explained | None:
     return _explain(np.empty((len(missed), 0)), columns.reshape(-1, _MOMENTS), missed, 2 * len(within.start))
 
 
-def explain_smear(solved: TurnSolution, kept: NDArray[np.bool_] | None = None) -> _Explained:
-    """Return by how much the coefficients of the derivatives seem to be more than was taken off."""
-    segments = solved.readings.in_pieces(solved.rest)
-    chosen = np.ones(len(segments.start), dtype=np.bool_) if kept is None else kept
-    left, slopes = model(segments.part(chosen), solved.scale, solved.theta, solved.theta.size > 9)
-    columns = directions_smeared(segments, solved.readings.derivatives, solved.scale, solved.theta)
-    across = normals(segments.after[chosen])
+def explain_smear(solved: TurnSolution) -> _Explained:
+    """Return by how much the coefficients of the derivatives seem to be more than was taken off, in the kept turns.
+
+    Turns that were set aside may be so for other reasons: a knock misses by any amount. A filter shows in the others.
+    """
+    readings, kept = solved.readings, solved.kept
+    segments = solved.segments
+    left, slopes = model(segments, solved.scale, solved.theta, solved.theta.size > 9)
+    columns = directions_smeared(segments, readings.derivatives[:, kept], solved.scale, solved.theta)
+    across = normals(segments.after)
 
     def project(vectors: Array) -> Array:
         turns = vectors.reshape(len(across), 3, -1)
         return np.asarray(np.einsum("mij,mjk->mik", across, turns).reshape(2 * len(across), -1))
 
     design = project(slopes)
-    added = project(columns.reshape(len(segments.start), 3, -1)[chosen])
-    return _explain(design, added, project(left)[:, 0], len(design))
+    return _explain(design, project(columns), project(left)[:, 0], len(design))
 
 
 def _explain(design: Array, columns: Array, values: Array, count: int) -> _Explained:
