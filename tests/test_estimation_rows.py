@@ -364,4 +364,17 @@ def test_a_coarse_sensor_that_stays_on_a_step_is_not_stuck_and_a_fine_one_is():
     assert stuck_run(held, [np.round(0.1 * each) for each in others]) is None  # nobody changes
     ends = np.where((time >= 3000) & (time < 3500), 9.0, noise[0])
     assert stuck_run(ends, others) == (3000, 500)
-    assert stuck_run(ends, others, at_ends=False) is None
+    assert stuck_run(ends, others, moving=True) is None
+
+
+def test_a_coarse_sensor_that_rests_between_motions_is_not_stuck():
+    """Steps of 1 and noise of 0.1, beside sensors with noise of 1, which change in each row at rest, too."""
+    rng = np.random.default_rng(3)
+    motion = 200 * np.sin(np.arange(8000) / 20)
+    motion[3000:3400] = motion[3000]
+    others = [motion + rng.standard_normal(8000) for _ in range(3)]
+    coarse = np.round(motion + 0.1 * rng.standard_normal(8000))
+    coarse[3000:3400] = coarse[3000]
+    assert stuck_run(coarse, others, moving=True) is None
+    coarse[5000:5500] = coarse[5000]
+    assert stuck_run(coarse, others, moving=True) == (5000, 500)

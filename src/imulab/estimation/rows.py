@@ -480,6 +480,7 @@ def _shown(names: Sequence[str]) -> str:
 
 
 _STUCK, _CHANGING = 50, 0.5  # samples of one value, while in others so many of the steps are none of 0
+_PARTS = 5  # of a run, whose means show whether others move
 _COARSE = 1.5  # rows to a change; beyond, steps are as large as the noise, and staying on one is no fault
 
 
@@ -495,15 +496,16 @@ def edges_of_runs(values: Array) -> NDArray[np.intp]:
     return np.concatenate([[0], changes, [len(values)]])
 
 
-def stuck_run(values: Array, others: Sequence[Array], *, at_ends: bool = True) -> tuple[int, int] | None:
+def stuck_run(values: Array, others: Sequence[Array], *, moving: bool = False) -> tuple[int, int] | None:
     """Return first row and length of the longest run of one value, if the column is stuck there while others change.
 
     Parameters
     ----------
     values, others
         The column and those of the other sensors, shape (m,) each.
-    at_ends
-        Whether a run at the column's largest or smallest value counts, which in motion is the end of its range.
+    moving
+        Whether the recording is of motion: there a run at the column's largest or smallest value is the end of its
+        range, and one while the others' level changes by no more than two of its steps is a coarse sensor at rest.
     """
     edges = edges_of_runs(values)
     begin, end = edges[(longest := int(np.argmax(np.diff(edges)))) : longest + 2].tolist()
@@ -511,8 +513,11 @@ def stuck_run(values: Array, others: Sequence[Array], *, at_ends: bool = True) -
     usual = (len(values) - length) / max(len(edges) - 2, 1)
     if length <= _STUCK or usual > _COARSE or not others:
         return None
-    if not at_ends and values[begin] in (values.min(), values.max()):
-        return None
+    if moving:
+        step = float(np.abs(values[edges[1:-1]] - values[edges[1:-1] - 1]).min(initial=np.inf))
+        levels = [[part.mean() for part in np.array_split(other[begin:end], _PARTS)] for other in others]
+        if values[begin] in (values.min(), values.max()) or np.median(np.ptp(levels, axis=1)) <= 2 * step:
+            return None
     changing = [float(np.mean(other[begin + 1 : end] != other[begin : end - 1])) for other in others]
     return (begin, length) if np.median(changing) > 0 and np.mean(changing) > _CHANGING else None
 

@@ -192,12 +192,12 @@ def _check_readings(recording: Recording, elements: Elements) -> Checks:
     return checks
 
 
-def _refuse_stuck(recording: Recording, elements: Elements, *, at_ends: bool = True) -> None:
+def _refuse_stuck(recording: Recording, elements: Elements, *, moving: bool = False) -> None:
     """Refuse a gyro that repeats one reading for a while, while the others change."""
     for row in elements.names:
         for name in row:
             others = [recording.columns[other] for other in row if other != name]
-            if (run := stuck_run(recording.columns[name], others, at_ends=at_ends)) is not None:
+            if (run := stuck_run(recording.columns[name], others, moving=moving)) is not None:
                 raise DataError(
                     f"{recording.name}: {stuck_message(recording, name, run)}; leave it out, or read a part without "
                     "it (--window)"
@@ -242,7 +242,7 @@ def _align_in_motion(moving: Recording, elements: Elements, rest: AtRest) -> tup
             f"{len(elements.axes)} as at rest"
         )
     _check_readings(moving, its)
-    _refuse_stuck(moving, its, at_ends=False)  # those are at the end of their range
+    _refuse_stuck(moving, its, moving=True)
     clipped = _clipped_rows(_readings_si(moving, its))
     left_out = _bridge_rows(moving, its)
     readings = _readings_si(left_out.recording, its)

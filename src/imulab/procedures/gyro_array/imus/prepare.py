@@ -211,7 +211,7 @@ def _check_alive(recording: Recording, names: list[str]) -> None:
                 f"{recording.name}: column {name}: all samples are {values[0]:g}: a dead sensor; leave its IMU out"
             )
         others = [recording.columns[other] for other in names if other[:4] == name[:4] and other != name]
-        if (run := stuck_run(values, others, at_ends=False)) is not None:
+        if (run := stuck_run(values, others, moving=True)) is not None:
             raise DataError(f"{recording.name}: {stuck_message(recording, name, run)}; leave its IMU out")
 
 
