@@ -9,7 +9,18 @@ import imulab as il
 from imulab.cli import main
 from imulab.display import Note
 from imulab.errors import DataError
-from imulab.estimation.rows import distinct, find_step, leave_out, median, medians, quantile, stuck_run
+from imulab.estimation import rows
+from imulab.estimation.rows import (
+    count_changes,
+    distinct,
+    find_step,
+    leave_out,
+    long_runs,
+    median,
+    medians,
+    quantile,
+    stuck_run,
+)
 from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
 from imulab.recording import Recording
 from test_tumble_attitudes import errors, fitted
@@ -378,3 +389,21 @@ def test_a_coarse_sensor_that_rests_between_motions_is_not_stuck():
     assert stuck_run(coarse, others, moving=True) is None
     coarse[5000:5500] = coarse[5000]
     assert stuck_run(coarse, others, moving=True) == (5000, 500)
+
+
+@pytest.mark.parametrize("at_once", [64, 1 << 16])
+def test_long_runs_are_those_between_all_changes(at_once, monkeypatch):
+    monkeypatch.setattr(rows, "_AT_ONCE", at_once)
+    rng = np.random.default_rng(7)
+    for _ in range(300):
+        values = rng.integers(0, rng.integers(2, 6), rng.integers(1, 400)).astype(float)
+        for _ in range(rng.integers(0, 4)):
+            begin = rng.integers(0, len(values))
+            values[begin : begin + rng.integers(1, 90)] = values[begin]
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1, [len(values)]])
+        assert count_changes(values) == len(edges) - 2
+        for least in (4, 5, 20, 51):
+            long = np.diff(edges) >= least
+            first, behind = long_runs(values, least)
+            assert first.tolist() == edges[:-1][long].tolist()
+            assert behind.tolist() == edges[1:][long].tolist()

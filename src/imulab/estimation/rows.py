@@ -484,16 +484,45 @@ _PARTS = 5  # of a run, whose means show whether others move
 _COARSE = 1.5  # rows to a change; beyond, steps are as large as the noise, and staying on one is no fault
 
 
-def edges_of_runs(values: Array) -> NDArray[np.intp]:
-    """Return the rows at which runs of one value begin, and the number of rows last, shape (runs + 1,).
+def long_runs(values: Array, least: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return first rows, and rows behind the last, of the runs of at least `least` rows of one value, 4 or more.
+
+    Such a run holds two rows, half of that apart, among those that are looked at first.
 
     Examples
     --------
-    >>> edges_of_runs(np.array([2.0, 2.0, 5.0])).tolist()
-    [0, 2, 3]
+    >>> first, behind = long_runs(np.array([2.0, 2.0, 5.0, 5.0, 5.0, 5.0, 1.0]), 4)
+    >>> first.tolist(), behind.tolist()
+    ([2], [6])
     """
-    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
-    return np.concatenate([[0], changes, [len(values)]])
+    apart = least // 2
+    size, last = _AT_ONCE // apart * apart, len(values) - 1
+    places = [np.empty(0, dtype=np.intp)]
+    for start in range(0, last + 1 - apart, size):
+        few = values[start : start + size + 1 : apart]
+        places.append(start + apart * np.flatnonzero(few[1:] == few[:-1]))
+        release(values)
+    held = np.concatenate(places)
+    for k in range(1, apart):
+        held = held[values[held + k] == values[held]]
+    first = held[np.diff(held, prepend=-least) != apart]
+    end = held[np.diff(held, append=last + least) != apart] + apart
+    for _ in range(apart):
+        first = first - ((first > 0) & (values[first - 1] == values[first]))
+        end = end + ((end < last) & (values[np.minimum(end + 1, last)] == values[end]))
+    release(values)
+    long = end + 1 - first >= least
+    return first[long], end[long] + 1
+
+
+def count_changes(values: Array) -> int:
+    """Return how many rows differ from the row before."""
+    changes = 0
+    for start in range(0, len(values) - 1, _AT_ONCE):
+        part = values[start : start + _AT_ONCE + 1]
+        changes += int(np.count_nonzero(part[1:] != part[:-1]))
+        release(values)
+    return changes
 
 
 def stuck_run(values: Array, others: Sequence[Array], *, moving: bool = False) -> tuple[int, int] | None:
@@ -507,14 +536,17 @@ def stuck_run(values: Array, others: Sequence[Array], *, moving: bool = False) -
         Whether the recording is of motion: there a run at the column's largest or smallest value is the end of its
         range, and one while the others' level changes by no more than two of its steps is a coarse sensor at rest.
     """
-    edges = edges_of_runs(values)
-    begin, end = edges[(longest := int(np.argmax(np.diff(edges)))) : longest + 2].tolist()
+    first, behind = long_runs(values, _STUCK + 1)
+    if not first.size or not others:
+        return None
+    longest = int(np.argmax(behind - first))
+    begin, end = int(first[longest]), int(behind[longest])
     length = end - begin
-    usual = (len(values) - length) / max(len(edges) - 2, 1)
-    if length <= _STUCK or usual > _COARSE or not others:
+    if (len(values) - length) / max(count_changes(values), 1) > _COARSE:
         return None
     if moving:
-        step = float(np.abs(values[edges[1:-1]] - values[edges[1:-1] - 1]).min(initial=np.inf))
+        steps = np.abs(np.diff(values))
+        step = float(steps.min(where=steps > 0, initial=np.inf))
         levels = [[part.mean() for part in np.array_split(other[begin:end], _PARTS)] for other in others]
         if values[begin] in (values.min(), values.max()) or np.median(np.ptp(levels, axis=1)) <= 2 * step:
             return None

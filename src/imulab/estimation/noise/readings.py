@@ -17,7 +17,7 @@ from imulab.display import Bad, Finding, Note
 from imulab.errors import DataError
 from imulab.estimation.decisions import COLUMN_STUCK
 from imulab.estimation.likely_unit import STATE_UNIT, no_gravity
-from imulab.estimation.rows import deviation_of_steps, distinct, edges_of_runs, median, resolution
+from imulab.estimation.rows import count_changes, deviation_of_steps, distinct, long_runs, median, resolution
 from imulab.estimation.sampling import FEW
 from imulab.recording import Array, Recording, stored_as
 from imulab.units import to_si
@@ -227,19 +227,22 @@ def _stuck(recording: Recording, names: Sequence[str]) -> list[str]:
     """Return a message for each column that keeps one value for longer than its noise allows by chance."""
     notes: list[str] = []
     for name in names:
-        edges = edges_of_runs(recording.column(name))
-        length = np.diff(edges)
-        long = length >= _STUCK
-        repeats = float((length - 1)[~long].sum() / max(length[~long].sum(), 1))
+        begin, end = long_runs(recording.column(name), _STUCK)
+        if not begin.size:
+            continue
+        length = end - begin
+        others = len(recording) - int(length.sum())  # rows, in so many runs
+        runs = count_changes(recording.column(name)) + 1 - len(length)
+        repeats = (others - runs) / max(others, 1)
         # A row is like the one before in the share that is the sum of p_k^2, p_k the share of value k, so that the most
         # frequent value follows itself no more often than by the root of it.
         again = np.sqrt(max(repeats, 1e-3))
-        long &= len(recording) * again ** (np.minimum(length, 1000.0) - 1) < COLUMN_STUCK.level
+        long = len(recording) * again ** (np.minimum(length, 1000.0) - 1) < COLUMN_STUCK.level
         rows = int(length[long].sum())
         if not 0 < rows < len(recording) / 2 or repeats > 0.5:  # steps coarser than the noise repeat by themselves
             continue
         time = recording.si("time")
-        first, last = int(edges[:-1][long][0]), int(edges[1:][long][-1]) - 1
+        first, last = int(begin[long][0]), int(end[long][-1]) - 1
         kind = Note if rows < FEW * len(recording) else Finding
         notes.append(
             kind(

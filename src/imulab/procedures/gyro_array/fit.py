@@ -305,6 +305,7 @@ def _warn_steps(still: Recording, elements: Elements, rest: AtRest) -> list[str]
     found = []
     for name in (name for row in elements.names for name in row):
         step = find_step(np.asarray(still.column(name), dtype=np.float64))
+        release(still.column(name))
         if step is not None and abs(to_si(step.size, still.units[name])) > _HARMFUL_STEP * usual:
             found.append(f"{name} by {step.size:+.2g} {still.units[name]} near {still.si('time')[step.sample]:.4g} s")
     if not found:
