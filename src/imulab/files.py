@@ -230,8 +230,8 @@ def load_toml(path: str | Path, name: str, what: str) -> dict[str, Any]:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         at = re.search(r"line (\d+)", str(error))
-        found = f": {quoted(lines[int(at[1]) - 1].strip())}" if at else ""
-        raise ReadError(f"{name}: the {what} file is not TOML: {error}{found}") from None
+        shown = f": {quoted(lines[int(at[1]) - 1].strip())}" if at else ""
+        raise ReadError(f"{name}: the {what} file is not TOML: {error}{shown}") from None
     except ValueError:  # Python reads no whole numbers of thousands of digits
         raise wide from None
     except RecursionError:

@@ -144,8 +144,8 @@ def export(
     source = file if noise else ""
     options = ExportOptions(lossy, number, noise_keys, source, fusions, mag_mount, tell, mag_number, files)
     written = exporters.export(to, loaded, Path(folder), options)
-    given = {"device_id": number, "mag_device_id": mag_number, "noise": noise, "mag_mount": mag_mount != MAG_MOUNTS[0]}
-    for line in _without_effect(to, [name for name, value in given.items() if value], loaded):
+    chosen = {"device_id": number, "mag_device_id": mag_number, "noise": noise, "mag_mount": mag_mount != MAG_MOUNTS[0]}
+    for line in _without_effect(to, [name for name, value in chosen.items() if value], loaded):
         tell(line)
     return written
 
@@ -161,11 +161,11 @@ def _device_numbers(device_id: int | str, mag_device_id: int | str) -> tuple[int
     return number, mag_number
 
 
-def _without_effect(to: str, given: Sequence[str], records: Sequence[Calibration]) -> Iterator[str]:
+def _without_effect(to: str, names: Sequence[str], records: Sequence[Calibration]) -> Iterator[str]:
     """Yield a sentence on each option that has no effect."""
     parameters = {name for record in records for name in record.parameters}
     with_mag = any(name.startswith("mag_") for name in parameters)
-    for name in given:
+    for name in names:
         if to not in _TAKEN_BY[name]:
             yield f"{to}: --{name.replace('_', '-')} has no effect: it is for {' and '.join(_TAKEN_BY[name])}"
         elif name.startswith("mag_") and not with_mag:

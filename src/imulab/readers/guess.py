@@ -301,12 +301,12 @@ def guess_table(lines: Sequence[str], name: str, *, prefix: str = "", encoding: 
     if best is None:
         shown = next((line.strip() for line in lines if line.strip() and not line.startswith("#")), "")
         if not shown:
-            found = (
+            contents = (
                 "only comments; expected a line of titles and rows"
                 if any(map(str.strip, lines))
                 else "the file is empty"
             )
-            raise GuessError(f"{name}: {found}")
+            raise GuessError(f"{name}: {contents}")
         raise GuessError(
             f"{name}: no line of titles names the axes of a sensor; the first is {quoted(shown)}{_BY_HAND}"
         )

@@ -302,17 +302,17 @@ def _warn_scales(alignment: Alignment, elements: Elements) -> list[str]:
 def _warn_steps(still: Recording, elements: Elements, rest: AtRest) -> list[str]:
     """Return a message on gyros whose level changes at rest by much more than the uncertainty of a usual bias."""
     usual = float(np.median(rest.uncertainty))
-    found = []
+    steps = []
     for name in (name for row in elements.names for name in row):
         step = find_step(np.asarray(still.column(name), dtype=np.float64))
         release(still.column(name))
         if step is not None and abs(to_si(step.size, still.units[name])) > _HARMFUL_STEP * usual:
-            found.append(f"{name} by {step.size:+.2g} {still.units[name]} near {still.si('time')[step.sample]:.4g} s")
-    if not found:
+            steps.append(f"{name} by {step.size:+.2g} {still.units[name]} near {still.si('time')[step.sample]:.4g} s")
+    if not steps:
         return []
     return [
         Finding(
-            f"the level changes at rest: {first_of(found, 3)}; the bias is the mean of both levels",
+            f"the level changes at rest: {first_of(steps, 3)}; the bias is the mean of both levels",
             "record again at rest, or read the part after the change (--interval)",
         )
     ]
