@@ -320,8 +320,8 @@ def reservations(record: Calibration) -> list[str]:
         "measured: uncertainties do not hold its error."
     )
     gauge = record.model.get("gauge")
-    said = [warning for warning in record.warnings if SLOWER_NOISE in warning]
-    return [earth, *[relative] * (gauge not in (None, TRUTH)), *said]
+    slower_noise = [warning for warning in record.warnings if SLOWER_NOISE in warning]
+    return [earth, *[relative] * (gauge not in (None, TRUTH)), *slower_noise]
 
 
 def _calibration(record: ArrayRecord) -> Exhibits:
