@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
@@ -183,16 +183,17 @@ def _noises(
     """Return the noise of the columns `wanted`, with notes; a column of a sensor that moved has no coefficients."""
     notes: list[str] = []
     moved = moved_columns(recording, names, rate)
-    values = map(recording.column, wanted)  # one at a time: a long log is large
-    units, reasons = [recording.units[name] for name in wanted], [moved.get(name, "") for name in wanted]
+    values, units = [recording.column(name) for name in wanted], [recording.units[name] for name in wanted]
+    reasons = [moved.get(name, "") for name in wanted]
     noises = dict(zip(wanted, columns_noise(values, rate, reasons, units=units), strict=True))
-    for name, unit in zip(wanted, units, strict=True):
+    for name in wanted:
         samples = recording.si(name)
         if name not in moved and (step := find_step(samples)) is not None:
             notes.append(_step_line(recording, name, step))
         del samples  # before the next is made
-        if not isinstance(taus, str) or taus != "octave":
-            noises[name] = replace(noises[name], curve=_curve(recording.column(name), unit, rate, taus))
+    if not isinstance(taus, str) or taus != "octave":
+        for name, curve in zip(wanted, _curves(values, units, rate, taus), strict=True):
+            noises[name] = replace(noises[name], curve=curve)
     return noises, notes + [prefixed(recording.name, line) for line in noise_lines(noises)]
 
 
@@ -233,7 +234,7 @@ def _listed(values: Array | None) -> list[float | None] | None:
 
 
 def columns_noise(
-    columns: Iterable[Array],
+    columns: Sequence[Array],
     rate: float,
     moved: Sequence[str] = (),
     candidates: tuple[str, ...] = CANDIDATES,
@@ -249,18 +250,16 @@ def columns_noise(
     DataError, OptionError
         As for `allan_deviation`; fewer than 50 samples.
     """
-    curves, why, stretches = [], [], []
-    of_columns = zip(moved or repeat(""), units or repeat("1"), strict=False)
-    for samples in columns:
-        reason, unit = next(of_columns)
-        curves.append(_curve(samples, unit, rate))
-        if len(samples) < FEWEST:
-            raise DataError(
-                f"noise coefficients: {len(samples)} samples are too few; expected some {FEWEST} samples or more"
-            )
-        why.append(reason or _unfit(samples, float(curves[-1].deviation[0]) / to_si(1.0, unit)))
+    units = units or ["1"] * len(columns)
+    curves = _curves(columns, units, rate)
+    if columns and len(columns[0]) < FEWEST:
+        raise DataError(
+            f"noise coefficients: {len(columns[0])} samples are too few; expected some {FEWEST} samples or more"
+        )
+    why, stretches = [], []
+    for samples, unit, curve, reason in zip(columns, units, curves, moved or repeat(""), strict=False):
+        why.append(reason or _unfit(samples, float(curve.deviation[0]) / to_si(1.0, unit)))
         stretches += [] if why[-1] else [[transformed(samples, 1 / rate, unit=unit)]]
-        del samples  # before the next is made
     fit = [k for k, reason in enumerate(why) if not reason]
     analysed_columns = analyses(stretches, candidates) if fit else []
     models = dict(zip(fit, zip(read_coefficients(analysed_columns), analysed_columns, strict=True), strict=True))
@@ -269,10 +268,17 @@ def columns_noise(
     ]
 
 
-def _curve(samples: Array, unit: str, rate: float, taus: str | Array = "octave") -> DeviationCurve:
-    """Return the Allan curve, SI, of samples in a unit; only the curve is converted, since a long log is large."""
-    curve, factor = allan_deviation(samples, rate, taus), to_si(1.0, unit)
-    return replace(curve, deviation=curve.deviation * factor, standard_uncertainty=curve.standard_uncertainty * factor)
+def _curves(
+    columns: Sequence[Array], units: Sequence[str], rate: float, taus: str | Array = "octave"
+) -> list[DeviationCurve]:
+    """Return the Allan curves, SI, of columns in their units; only curves are converted, since a long log is large."""
+    room = np.empty(len(columns[0]) + 1) if columns else None  # once: its memory costs as much time as the sums
+    curves = [allan_deviation(samples, rate, taus, room) for samples in columns]
+    factors = [to_si(1.0, unit) for unit in units]
+    return [
+        replace(curve, deviation=curve.deviation * factor, standard_uncertainty=curve.standard_uncertainty * factor)
+        for curve, factor in zip(curves, factors, strict=True)
+    ]
 
 
 def _unfit(samples: Array, noise: float) -> str:

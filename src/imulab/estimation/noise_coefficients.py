@@ -63,7 +63,9 @@ class DeviationCurve:
         )
 
 
-def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -> DeviationCurve:
+def allan_deviation(
+    samples: Array, rate: float, taus: str | Array = "octave", room: Array | None = None
+) -> DeviationCurve:
     """Return the overlapping Allan deviation of evenly spaced samples.
 
     ``sigma^2(m / rate) = sum_k (x_{k+2m} - 2 x_{k+m} + x_k)^2 / (2 (m / rate)^2 (N - 2m))``, x the integral of the
@@ -78,6 +80,8 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
     taus
         ``octave`` (m = 1, 2, 4 ...), ``dense`` (24 a decade), or averaging times in s, shape (t,), which are rounded to
         whole numbers of samples.
+    room
+        Shape (n + 1,), overwritten: a long array costs time to make, and columns of one length can share it.
 
     Raises
     ------
@@ -91,7 +95,7 @@ def allan_deviation(samples: Array, rate: float, taus: str | Array = "octave") -
         raise DataError(f"Allan deviation: expected at least {_FEWEST} samples of one quantity, found {data.shape}")
     if not rate > 0 or not math.isfinite(rate):
         raise OptionError(f"sampling rate {rate:g}: expected a positive number of Hz")
-    integral = np.empty(len(data) + 1)
+    integral = np.empty(len(data) + 1) if room is None else room
     integral[0] = 0.0
     centred, first = integral[1:], data[0]
     for start in range(0, len(data), _AT_ONCE):  # samples on disk come into memory part by part

@@ -14,7 +14,7 @@ c_3 makes of its scale factor, ``c_3 <p^4> / <p^2>``, is in the uncertainties wh
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -28,7 +28,7 @@ from imulab.estimation.decisions import ELEMENT_BENDS, READINGS_LATE
 from imulab.estimation.least_squares import coverage_factor
 from imulab.estimation.noise_coefficients import DeviationCurve
 from imulab.procedures.gyro_array.elements import Elements
-from imulab.recording import Array, Recording
+from imulab.recording import Array, Recording, release
 from imulab.records.calibration import Calibration
 from imulab.records.mean_noise import mean_uncertainties
 from imulab.units import to_si
@@ -66,15 +66,12 @@ def at_rest(still: Recording, rate: float, elements: Elements, record: Calibrati
     """
     n, duration = elements.count, len(still) / rate
     names = [name for row in elements.names for name in row]
-    bias: list[float] = []
-
-    def columns() -> Iterator[Array]:
-        for name in names:
-            values = still.column(name)
-            bias.append(to_si(float(values.mean()), still.units[name]))
-            yield values
-
-    each = columns_noise(columns(), rate, candidates=_CANDIDATES, units=[still.units[name] for name in names])
+    columns, units = [still.column(name) for name in names], [still.units[name] for name in names]
+    bias = []
+    for values, unit in zip(columns, units, strict=True):
+        bias.append(to_si(float(values.mean()), unit))
+        release(values)
+    each = columns_noise(columns, rate, candidates=_CANDIDATES, units=units)
     notes: list[str] = []
     if record is None:
         spread = np.array([gyro.mean_uncertainty(duration) for gyro in each])
