@@ -154,14 +154,15 @@ def find_step(samples: Array) -> Step | None:
         return None
     means = samples[: _BLOCKS * length].reshape(_BLOCKS, length).mean(axis=1)
     total = np.concatenate([[0.0], np.cumsum(means - means.mean())])
-    white = deviation_of_steps(samples) / np.sqrt(length)
     best, step = 1.0, None
     for width, limit in _LIMITS.items():
         place = np.arange(width, _BLOCKS - width + 1)
         change = (total[place + width] - 2 * total[place] + total[place - width]) / width
         index = int(np.argmax(np.abs(change)))
         others = np.abs(np.delete(change, np.s_[max(0, index - 2 * width) : index + 2 * width + 1]))
-        least = max(limit * MAD_TO_SIGMA * median(others), _WHITE * white / np.sqrt(width))
+        least = limit * MAD_TO_SIGMA * median(others)
+        if abs(change[index]) > best * least:  # as hardly ever, so that white noise is seldom asked for
+            least = max(least, _WHITE * deviation_of_steps(samples) / np.sqrt(length * width))
         if least > 0 and abs(change[index]) > best * least:
             best = abs(change[index]) / least
             step = Step(float(change[index]), int(place[index]) * length, 4 * length)
