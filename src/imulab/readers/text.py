@@ -40,6 +40,7 @@ _BLOCK_BYTES = 1 << 21  # read at once
 WORTH_SHARING = 1 << 19  # bytes from which a block is shared among threads
 _MOST_THREADS = 8  # that parse one file
 LONGEST_LINE = 1 << 20  # bytes: a longer line without an end is no text
+_OF_DATA = re.compile(rb"^(?!#)[^\n]*\S[^\n]*", re.M)  # a line that is neither blank nor a comment
 
 
 class ParserThreads:
@@ -202,11 +203,9 @@ class Lines:
     def first(self) -> bytes:
         """Return the first line that is neither blank nor a comment without consuming it; empty if there is none."""
         while True:
-            lines = self._rest[self._at :].split(b"\n")
-            whole = lines if self._ended or self.waiting > LONGEST_LINE else lines[:-1]
-            line_of_data = next((line for line in whole if line.strip() and not line.startswith(b"#")), b"")
-            if line_of_data or whole is lines:
-                return line_of_data
+            found = _OF_DATA.search(self._rest, self._at)
+            if self._ended or self.waiting > LONGEST_LINE or (found and found.end() < len(self._rest)):
+                return found[0] if found else b""
             self._read_more()
 
     def head(self, size: int) -> bytes:
