@@ -33,6 +33,7 @@ from imulab.exporters.model import (
     ROTATION_NOT_TOLD,
     UnitModel,
     accel_terms,
+    check_si,
     gyro_terms,
     held_accelerometers,
     magnetometers_alone,
@@ -149,10 +150,7 @@ def offset_law(
     laws = procedure_of(over[0]).laws(over[0])
     if laws is None:
         return _law_of_rates(over[0], target, reference)
-    if laws.unit != "m/s^2":
-        raise OptionError(
-            f"{target}: corrects outputs in m/s^2, but the record is for accelerometers with outputs in {laws.unit}"
-        )
+    check_si(target, "accelerometers", laws.unit)
     middle, half = 0.5 * (laws.low + laws.high), 0.5 * (laws.high - laws.low)
     about = middle if reference is None else reference
     temperature = middle + half * _NODES

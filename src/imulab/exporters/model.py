@@ -104,12 +104,19 @@ def refuse_raw(unit: UnitModel, target: str) -> None:
     OptionError
         It is one; the message names the unit.
     """
-    for sensor, triad in (("accelerometers", unit.accel), ("gyroscopes", unit.gyro)):
-        if triad is not None and triad.unit not in ("m/s^2", "rad/s"):
-            raise OptionError(
-                f"{target}: corrects outputs in {'m/s^2' if sensor == 'accelerometers' else 'rad/s'}, but the record "
-                f"is for {sensor} with outputs in {triad.unit}"
-            )
+    for sensors, triad in (("accelerometers", unit.accel), ("gyroscopes", unit.gyro)):
+        if triad is not None:
+            check_si(target, sensors, triad.unit)
+
+
+def check_si(target: str, sensors: str, unit: str) -> None:
+    """Refuse accelerometers or gyroscopes with outputs in another unit than that of an autopilot's logs; as above."""
+    if unit not in ("m/s^2", "rad/s"):
+        raise OptionError(
+            f"{target}: corrects outputs in {'m/s^2' if sensors == 'accelerometers' else 'rad/s'}, but the record is "
+            f"for {sensors} with outputs in {unit}; fit a log of the autopilot itself, or export to c or blob, which "
+            f"take outputs in {unit}"
+        )
 
 
 # --- what is lost --------------------------------------------------------------------------------------------------
