@@ -247,6 +247,43 @@ def test_an_angle_of_the_table_serves_as_its_rate():
     assert found.value == pytest.approx(SCALE[2], abs=4 * found.standard_uncertainty)
 
 
+def by_angle(clock, column=False, **how):
+    """A run whose table wrote its angle, by a clock that is fast by `clock`."""
+    made = recording("+z", noise=1e-4, rng=np.random.default_rng(1), **how)
+    columns = {n: v for n, v in made.columns.items() if column or n != "table_rate"}
+    columns |= {"time": made.column("time") * (1 - clock), "table_angle": np.cumsum(made.column("table_rate")) / 50}
+    return il.Recording(columns, {n: made.units.get(n, "deg") for n in columns}, name="angle.csv")
+
+
+@pytest.mark.parametrize(
+    ("clock", "listed", "stated", "state", "said"),
+    [
+        (3e-3, True, "100 ppm", "look", "are +0.301 % off those listed"),
+        (-3e-3, True, None, "look", "are -0.299 % off those listed"),
+        (2e-5, True, "100 ppm", "good", None),
+        (2e-5, True, None, "good", None),
+        (3e-3, False, None, "look", "whose uncertainty was not stated"),
+        (3e-3, False, "0.3 %", "good", "the stated 0.3 % of the table must contain"),
+    ],
+)
+def test_a_clock_that_turns_an_angle_into_a_rate_shows_by_the_listed_rates_or_is_stated(
+    clock, listed, stated, state, said
+):
+    """A clock 0.3 % fast put S off by 30 of its standard uncertainties, verdict good."""
+    record = il.fit_rate(
+        by_angle(clock), rates=np.array(WAY) * DEGREE if listed else None, table_uncertainty=stated, latitude=0.0
+    ).calibration
+    about = [w for w in record.warnings if "table_angle" in w]
+    assert record.verdict.state == state
+    assert len(about) == (said is not None)
+    assert all(said in w for w in about)
+
+
+def test_a_clock_is_not_asked_for_where_the_table_wrote_its_rate_too():
+    record = il.fit_rate(by_angle(3e-3, column=True)).calibration
+    assert not any("table_angle" in w for w in record.warnings)
+
+
 def test_the_scatter_of_scale_factors_from_cycle_to_cycle_is_in_their_uncertainty():
     runs = [il.simulate_rate(faces="+z", noise="0.001 deg/s", hold="3 s", rate="50 Hz", seed=1) for _ in range(4)]
     made = []

@@ -26,7 +26,14 @@ from imulab.procedures.rate.schema import (
     RateTest,
     SweptRun,
 )
-from imulab.procedures.rate.solve import Linearity, RateProblem, RateSolution, model_parameters, temperature_slopes
+from imulab.procedures.rate.solve import (
+    EXACT,
+    Linearity,
+    RateProblem,
+    RateSolution,
+    model_parameters,
+    temperature_slopes,
+)
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
@@ -111,6 +118,7 @@ def note_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
 
 _MATTERS = 3.0  # times the uncertainty of a bias: the Earth's rate is warned of if it is larger
 _LARGEST = ("nonlinearity", "hysteresis")  # maxima of absolute values
+_CLOCK = 1e-4  # relative standard uncertainty of table and clock together where none was stated
 
 
 def make_record(
@@ -163,7 +171,8 @@ def make_record(
         warnings=(
             *_warn_other_unit(test, recordings),
             *_warn_output_unit(parameters, unit),
-            *_warn_table(test, parameters, axes is not None, any("table_angle" in source for source in recordings)),
+            *_warn_table(test, parameters, axes is not None),
+            *_warn_clock(test, recordings, dwells),
             *_warn_line(
                 linearity, parameters, dict(zip((AXES[k] for k in problem.gyros), solution.orders, strict=True)), order
             ),
@@ -319,15 +328,62 @@ def _warn_output_unit(parameters: Mapping[str, Parameter], unit: str) -> list[st
     ]
 
 
-def _warn_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool, by_angle: bool) -> list[str]:
+def _warn_clock(test: RateTest, recordings: Sequence[Recording], dwells: Sequence[Dwells]) -> list[str]:
+    """Return what is known of the recorder's clock, by which table_angle became a rate: an error of it is one of S.
+
+    It shows where the manifest lists the rates too: ``recorded = (1 + e) listed`` over all runs, a mean for each rate.
+    """
+    by_angle = ["table_angle" in recording and "table_rate" not in recording for recording in recordings]
+    if not any(by_angle):
+        return []
+    stated = test.relative_uncertainty
+    runs = zip(test.runs, dwells, by_angle, strict=True)
+    pairs = [(run.rates, reduced.rate) for run, reduced, angle in runs if angle and run.rates and reduced.sweep is None]
+    if not pairs:
+        if stated is not None:
+            return [
+                Note(
+                    f"table_angle became a rate by the recorder's clock: the stated {100 * stated:.3g} % of the "
+                    "table must contain the uncertainty of that clock"
+                )
+            ]
+        return [
+            Finding(
+                "table_angle became a rate by the recorder's clock, whose uncertainty was not stated and is in no "
+                "uncertainty of a scale factor: a clock without a crystal is off by 0.3 % and more",
+                "state it, with the table's (relative_standard_uncertainty, or --table-uncertainty), or list the rates "
+                "that the table ran as well",
+            )
+        ]
+    recorded = np.concatenate([rate for _, rate in pairs])
+    listed = np.concatenate(
+        [np.array(rates)[np.abs(rate[:, None] - np.array(rates)).argmin(axis=1)] for rates, rate in pairs]
+    )
+    rates, key = np.unique(listed, return_inverse=True)
+    means = np.bincount(key, recorded) / np.bincount(key)
+    square = float(rates @ rates)
+    error = float(rates @ (means - rates)) / square
+    scatter = np.sqrt(np.sum((means - (1 + error) * rates) ** 2) / max(len(rates) - 1, 1) / square)
+    limit = coverage_factor(None, 0.999) * (_CLOCK if stated is None else stated)
+    if abs(error) < limit + coverage_factor(len(rates) - 1, 0.999) * float(scatter) + EXACT:
+        return []
+    return [
+        Finding(
+            f"the rates by table_angle and the recorder's clock are {100 * error:+.3g} % off those listed: one of "
+            "them is wrong; the scale factors are by table_angle",
+            "check the clock; if it is wrong, leave table_angle out, so that the listed rates count",
+        )
+    ]
+
+
+def _warn_table(test: RateTest, parameters: Mapping[str, Parameter], by_axes: bool) -> list[str]:
     """Return what the stated uncertainties do not cover: the table's rates, the mounting, and the Earth's rate."""
     messages: list[str] = []
     if test.relative_uncertainty is None:
-        clock = ", with that of the recorder's clock by which table_angle became a rate," if by_angle else ""
         messages.append(
             Note(
-                f"the uncertainty that all rates of the table have in common{clock} was not stated, and is in no "
-                "uncertainty of a scale factor (relative_standard_uncertainty, or --table-uncertainty)"
+                "the uncertainty that all rates of the table have in common was not stated, and is in no uncertainty "
+                "of a scale factor (relative_standard_uncertainty, or --table-uncertainty)"
             )
         )
     triad = any(name.startswith("gyro_misalignment") for name in parameters)
