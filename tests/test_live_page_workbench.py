@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -293,6 +294,75 @@ def test_a_file_that_comes_late_does_not_hide_the_one_that_was_clicked_on(workbe
     page.locator("[data-name='imulab-files/two.csv']").wait_for()
     page.wait_for_timeout(300)
     assert page.get_by_role("heading", name="one.csv").count() == 1
+
+
+def arrive(page: Any, name: str) -> None:
+    """Let a file reach the session from elsewhere, so that a message tells every page of it."""
+    put = "name => fetch('/api/workbench/files/' + name, { method: 'PUT', body: 't;a' }).then(answer => answer.ok)"
+    assert page.evaluate(put, name)
+
+
+def test_a_click_on_run_runs_what_stands_there_whatever_comes_before_the_answer(workbench, new_page):
+    page = new_page(workbench.address)
+    drop(page, "rec.csv", tumble("own.csv"))
+    read(page)
+    page.get_by_label("order", exact=True).fill("1")
+    command(page)
+    held: list[Any] = []
+    page.route("**/api/workbench/command", lambda route: held.append(route), times=1)
+    run(page)
+    while not held:
+        page.wait_for_timeout(20)
+    arrive(page, "late.csv")
+    page.locator("[data-name='imulab-files/late.csv']").wait_for()  # and the form asks again
+    command(page)
+    held[0].continue_()
+    page.locator(".job .found").wait_for()
+    assert "--order 1" in page.locator(".job .command code").text_content()
+
+
+def test_what_comes_while_the_mouse_is_down_takes_no_click(workbench, new_page):
+    page = new_page(workbench.address)
+    drop(page, "one.csv", "t;a\n1;x\n")
+    drop(page, "rec.csv", tumble("own.csv"))
+    read(page)
+    page.locator("[data-name='imulab-files/one.csv']").hover()
+    page.mouse.down()
+    arrive(page, "a.csv")  # above it in the list
+    page.wait_for_timeout(300)
+    page.mouse.up()
+    page.get_by_role("heading", name="one.csv").wait_for()
+    page.locator("[data-name='imulab-files/a.csv']").wait_for()
+
+
+def test_what_is_told_of_a_recording_leaves_the_form_and_its_cursor(workbench, new_page):
+    held: list[Any] = []
+
+    def pass_on(server: Any, message: str) -> None:
+        told = json.loads(message)
+        if told["type"] == "opening" and "attitudes" in told:
+            held.append(message)
+        else:
+            socket[0].send(message)
+
+    def between(route: Any) -> None:
+        socket.append(route)
+        server = route.connect_to_server()
+        server.on_message(lambda message: pass_on(server, message))
+
+    socket: list[Any] = []
+    page = new_page("about:blank")
+    page.route_web_socket("**/ws", between)
+    page.goto(workbench.address)
+    drop(page, "rec.csv", tumble("own.csv"))
+    gravity = page.get_by_label("gravity", exact=True)
+    gravity.press_sequentially("9.")
+    while not held:
+        page.wait_for_timeout(20)
+    socket[0].send(held[-1])
+    page.get_by_text("attitudes at rest").wait_for()
+    page.keyboard.type("81")
+    assert gravity.input_value() == "9.81"
 
 
 def test_nothing_of_a_files_text_is_executed(workbench, new_page, folder):

@@ -25,6 +25,25 @@ export function show(element, shown) {
   if (element.hidden === shown) element.hidden = !shown;
 }
 
+// Draws what is in an element anew where it has changed, and returns whether it has: what is the same keeps the focus.
+export function redraw(element, children) {
+  const drawn = [...element.children];
+  if (children.length === drawn.length && children.every((each, number) => each.isEqualNode(drawn[number]))) return false;
+  element.replaceChildren(...children);
+  return true;
+}
+
+// Resolves once the mouse or the finger is up: what comes in the meantime would replace what it is on, and the click would
+// be lost. A list that opens takes the release for itself.
+let pressed = null;
+let release = null;
+const freed = () => setTimeout(() => { release?.(); pressed = release = null; }); // after the click
+addEventListener("pointerdown", event => { if (event.button === 0 && !event.target.closest?.("select")) pressed ||= new Promise(done => { release = done; }); }, true);
+for (const kind of ["pointerup", "pointercancel", "dragend", "blur"]) addEventListener(kind, freed, true);
+addEventListener("pointermove", event => { if (pressed && !event.buttons) freed(); }, true);
+
+export const unpressed = async () => pressed;
+
 let plotly = null;
 // Plotly, loaded when it is first asked for.
 export function loadPlotly() {

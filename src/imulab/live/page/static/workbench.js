@@ -2,7 +2,7 @@
 //
 // What is shown stands in the address (bench/state.js): the file, those chosen with it, the procedure, the range.
 
-import { h, put, show } from "./dom.js";
+import { h, put, redraw, show, unpressed } from "./dom.js";
 import { columnTable, layoutList } from "./bench/columns.js";
 import { form } from "./bench/form.js";
 import { card, from } from "./bench/job.js";
@@ -47,7 +47,9 @@ export function mount(into, given) {
   ui.where = h("p", { class: "where" });
   ui.try = h("p", { class: "try" }, "Nothing at hand? ", h("button", { type: "button", onclick: simulate }, "Simulate a recording"));
   ui.file = h("section", { class: "file", "aria-label": "The chosen file", hidden: true });
-  ui.procedure = h("section", { class: "procedure", "aria-labelledby": "bench-what", hidden: true });
+  ui.form = h("div", { class: "formplace" });
+  ui.procedure = h("section", { class: "procedure", "aria-labelledby": "bench-what", hidden: true },
+    ui.what = h("h2", { id: "bench-what" }), ui.fits = h("div", { class: "cards" }), ui.form, ui.more = h("div", {}));
   ui.jobs = h("div", { class: "jobs", "aria-label": "Results", role: "region" });
   ui.clear = h("p", { class: "clear", hidden: true }, h("button", { type: "button", onclick: () => ask("results", undefined, { method: "DELETE" }).catch(fail) }, "Clear the list of results"), " What they made stays.");
   ui.status = h("p", { class: "statusline", role: "status", hidden: true });
@@ -71,7 +73,8 @@ const fail = error => page.say(error.message, "bad");
 
 export const kept = () => `${folder && files.some(each => each.in_folder) ? `What was dropped and made is in the folder ${folder}. ` : ""}Start imulab again, and open the address that it prints.`;
 
-export function hear(message) {
+export async function hear(message) {
+  await unpressed();
   if (message.type === "files") listed(message);
   else if (message.type === "opening" && message.file === chosen?.name && JSON.stringify(message.reading) === JSON.stringify(reading)) opened(message);
   else if (message.type === "job") worked(message);
@@ -361,7 +364,7 @@ function summary({ head, done, attitudes, turned }) {
 
 // A record, and other files
 
-const start = (command, values) => ask("jobs", { command, values }).then(worked);
+const start = (command, values) => ask("jobs", { command, values }).then(job => { if (!cards.has(job.number)) worked(job); }); // else a message was first
 const targets = () => (forms.find(each => each.path === "export")?.fields.find(each => each.name === "to")?.choices || []).filter(each => each !== "c");
 
 function record() {
@@ -422,24 +425,21 @@ function offer() {
   const found = taking.map(each => ({ each, why: reason(each.path, known) }));
   const fits = found.filter(({ why }) => !why).map(({ each }) => each).sort((one, other) => likely(one.path, other.path, known));
   const free = forms.filter(each => each.fields.every(field => field.flag));
-  const button = (each, why) => h("button", {
-    type: "button", class: "card", disabled: Boolean(why), "data-path": each.path, "aria-pressed": why ? null : "false", onclick: () => choosing(each),
-  }, h("strong", {}, each.path), h("span", {}, why ? `${why[0].toUpperCase()}${why.slice(1)}.` : `${each.summary}.`));
-  const more = (label, items) => (items.length ? h("details", { class: "more" }, h("summary", {}, `${label} (${items.length})`), h("div", { class: "cards" }, items)) : null);
-  const old = ui.form;
-  const opened_ = [...ui.procedure.querySelectorAll("details.more")].filter(each => each.open).map(each => each.querySelector("summary").textContent.split(" (")[0]);
-  ui.form = h("div", { class: "formplace" });
-  ui.procedure.replaceChildren(h("h2", { id: "bench-what" }, !chosen ? "Or plan a test, and simulate it" : others.length ? `What to do with these ${grouped(1 + others.length)} files` : "What to do with it"),
-    h("div", { class: "cards" }, fits.map(each => button(each))), ui.form,
-    more("Not with this", found.filter(({ why }) => why).map(({ each, why }) => button(each, why))) || "",
-    more("Plan and simulate", free.map(each => button(each))) || "");
-  for (const each of ui.procedure.querySelectorAll(":scope > details")) each.open = opened_.includes(each.querySelector("summary").textContent.split(" (")[0]);
-  show(ui.procedure, true);
   const wanted = [...fits, ...free].find(each => each.path === procedure) || (known.kind === "recording" || known.kind === "rate" || known.kind === "centrifuge" ? fits[0] : null);
-  const same = wanted && filled === formKey(wanted);
-  if (same) { ui.form.replaceWith(old); ui.form = old; press(wanted); current.refresh(); }
+  const button = (each, why) => h("button", {
+    type: "button", class: "card", disabled: Boolean(why), "data-path": each.path, "aria-pressed": why ? null : String(each === wanted), onclick: () => choosing(each),
+  }, h("strong", {}, each.path), h("span", {}, why ? `${why[0].toUpperCase()}${why.slice(1)}.` : `${each.summary}.`));
+  const unfolded = [...ui.more.children].filter(each => each.open).map(each => each.dataset.label);
+  const more = (label, items) => (items.length ? [h("details", { class: "more", "data-label": label, open: unfolded.includes(label) }, h("summary", {}, `${label} (${items.length})`), h("div", { class: "cards" }, items))] : []);
+  const focused = document.activeElement?.dataset.path;
+  put(ui.what, !chosen ? "Or plan a test, and simulate it" : others.length ? `What to do with these ${grouped(1 + others.length)} files` : "What to do with it");
+  redraw(ui.fits, fits.map(each => button(each)));
+  redraw(ui.more, [...more("Not with this", found.filter(({ why }) => why).map(({ each, why }) => button(each, why))), ...more("Plan and simulate", free.map(each => button(each)))]);
+  show(ui.procedure, true);
+  if (focused) ui.procedure.querySelector(`[data-path="${focused}"]`)?.focus();
+  if (wanted && filled === formKey(wanted)) current.refresh();
   else if (wanted) fill(wanted);
-  else current = null;
+  else { ui.form.replaceChildren(); current = null; filled = ""; }
 }
 
 // The form of these files as they are read: while it is the same, what is typed and folded stays.

@@ -1,6 +1,6 @@
 // A form for a command, made from the command's own definition, with the command line that it makes.
 
-import { h, inWords, put, show } from "../dom.js";
+import { h, inWords, put, redraw, show } from "../dom.js";
 import { ask, copy } from "./net.js";
 
 const SOON = 200;
@@ -48,7 +48,8 @@ export function form(definition, { files, values = {}, run, keep = () => {} }) {
   const part = h("p", { class: "part", hidden: true });
   const element = h("form", { class: "form", novalidate: true, onsubmit: async event => {
     event.preventDefault();
-    if (await preview()) run(read()).catch(say);
+    const values = read(); // what stands there at the click, whatever comes before the answer
+    if (await preview(values)) run(values).catch(say);
   } },
     h("p", { class: "caption" }, inWords(definition.help)),
     h("div", { class: "fields" }, main.filter(({ of }) => of.kind !== "output").map(each => each.element)),
@@ -71,26 +72,26 @@ export function form(definition, { files, values = {}, run, keep = () => {} }) {
     show(refused, Boolean(error));
   }
   // Whether all values can be; what cannot is said at its field.
-  async function preview() {
+  async function preview(values = read()) {
     clearTimeout(later);
     const own = version;
-    const window_ = read().window;
+    const window_ = values.window;
     show(part, Boolean(window_));
     if (window_) part.replaceChildren(`Only ${window_.replace(":", " to ")} s of the file. `, h("button", { type: "button", onclick: () => set("window", "") }, "Take the whole file"));
     try {
-      const found = await ask("command", { command: definition.path, values: read() });
-      if (own !== version) return false;
+      const found = await ask("command", { command: definition.path, values });
+      const first = fields.find(each => found.wrong[each.of.name]);
+      if (own !== version) return !first;
       line.put(found.command);
       fields.filter(({ of }) => of.kind === "output").forEach(each => each.suggest(found.outputs));
       fields.forEach(each => wrong(each, found.wrong[each.of.name]));
       delete element.dataset.asked;
       say(null);
-      const first = fields.find(each => found.wrong[each.of.name]);
       if (first && document.activeElement === go) { const shut = first.element.closest("details"); if (shut) shut.open = true; first.element.querySelector("input, select").focus(); }
       return !first;
     } catch (error) {
       if (own === version) say(error);
-      return own === version;
+      return true; // it is refused where it is run, with the same sentence
     }
   }
   function changed() {
@@ -167,7 +168,7 @@ function field(of, files, value, changed) {
   if (of.kind === "texts") return texts(of, common, title, value, changed, help);
   if (of.kind === "file" && !of.other) {
     const select = h("select", common, options(value, of.required ? "choose a file" : "none"));
-    return built(select, () => select.value, { refresh() { select.replaceChildren(...options(select.value, of.required ? "choose a file" : "none").filter(Boolean)); } });
+    return built(select, () => select.value, { refresh() { redraw(select, options(select.value, of.required ? "choose a file" : "none")); } });
   }
   if (of.choices.length && !of.other) {
     const select = h("select", common, of.choices.map(each => h("option", { value: each, selected: each === (value || of.default) }, each)),
@@ -219,7 +220,7 @@ function several(of, id, title, options, value, changed, help) {
   return {
     of,
     read: () => [...rows.children].map(each => each.value).filter(Boolean),
-    refresh() { for (const each of rows.children) each.replaceChildren(...options(each.value, "none").filter(Boolean)); },
+    refresh() { for (const each of rows.children) redraw(each, options(each.value, each === rows.firstChild ? "choose a file" : "none")); },
     element: h("div", { class: "field files" }, h("label", { for: id }, title), list, help),
   };
 }

@@ -1,6 +1,6 @@
 // The list of files: one is shown, and any number of the same kind are chosen with it by their boxes.
 
-import { h, put, show } from "../dom.js";
+import { h, put, redraw, show } from "../dom.js";
 import { bytes } from "./net.js";
 import { grouped } from "./units.js";
 
@@ -52,10 +52,10 @@ export function fileList(act) {
     draw(files, chosen, others) {
       const focused = document.activeElement?.dataset?.name || document.activeElement?.dataset?.box;
       const kind = document.activeElement?.dataset?.box ? "box" : "name";
-      list.replaceChildren(...files.filter(each => !each.folder).flatMap(each => (each.kind === "folder"
+      const drawn = redraw(list, files.filter(each => !each.folder).flatMap(each => (each.kind === "folder"
         ? folder(each, files.filter(one => one.folder === each.name), chosen, others) : [row(each, chosen, others)])));
       show(place, files.length > 0);
-      if (focused) [...list.querySelectorAll(`[data-${kind}]`)].find(each => each.dataset[kind] === focused)?.focus();
+      if (drawn && focused) [...list.querySelectorAll(`[data-${kind}]`)].find(each => each.dataset[kind] === focused)?.focus();
     },
   };
 }

@@ -1,5 +1,7 @@
 // What the workbench asks the server for.
 
+import { unpressed } from "../dom.js";
+
 const HERE = "/api/workbench/";
 
 // A name of a file in an address; what it says stays a part of that address.
@@ -16,6 +18,7 @@ export async function ask(what, body, options = {}) {
     throw new Error("The program cannot be reached any more.");
   }
   const text = await answer.text();
+  await unpressed();
   if (answer.ok) return JSON.parse(text);
   let said = text;
   try { said = JSON.parse(text).error; } catch { /* a sentence of its own */ }

@@ -117,11 +117,12 @@ export function plots(place, act) {
     const [low, high] = ends();
     offset = Math.abs(head.first) > 1e6 ? Math.floor(head.first) : 0;
     const width = Math.max(area.clientWidth, 200);
-    const focused = drawn.indexOf(document.activeElement);
+    const controls = () => [...area.querySelectorAll("svg.plot, .channel")];
+    const focused = controls().indexOf(document.activeElement);
     const boxes = [...groups].map(([title, names], number) => one(title, names, low, high, width, number === groups.size - 1));
     drawn = boxes.map(each => each.svg);
     area.replaceChildren(...boxes.map(each => each.element));
-    drawn[focused]?.focus();
+    controls()[focused]?.focus();
     area.setAttribute("aria-busy", String(!known.done || rows !== head.rows));
     show(window_, range[0] !== null && head.timed);
     const unit = head.timed ? "s" : "";
@@ -138,7 +139,7 @@ export function plots(place, act) {
     const values = names.map(() => h("span", { class: "value" }));
     const legend = h("div", { class: "legend" }, h("strong", {}, title), names.map((name, number) => h("button", {
       type: "button", class: "channel", "aria-pressed": String(!isHidden(name)), title: isHidden(name) ? `show ${name}` : `hide ${name}`,
-      onclick: () => { keep("hidden", name, !isHidden(name)); const at = [...area.querySelectorAll(".channel")].indexOf(document.activeElement); draw(); area.querySelectorAll(".channel")[at]?.focus(); },
+      onclick: () => { keep("hidden", name, !isHidden(name)); draw(); },
     }, h("span", { class: `swatch c${number % 8}`, "aria-hidden": "true" }), name, values[number])));
     const svg = picture(title, names.map((name, number) => ({ name, number })).filter(({ name }) => !isHidden(name)), low, high, width, last);
     svg.readout = k => names.forEach((name, number) => {
