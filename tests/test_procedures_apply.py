@@ -13,7 +13,7 @@ from imulab.cli import main
 from imulab.device.unit import load_blob
 from imulab.display import Note, Verdict
 from imulab.errors import DataError, RecordError, UnitError
-from imulab.procedures.apply import apply, apply_blocks, loaded, warn_before_applying, warn_of_unit
+from imulab.procedures.apply import DoubtfulSamples, apply, apply_blocks, loaded, warn_before_applying, warn_of_unit
 from imulab.recording import Recording
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.writers import write
@@ -637,3 +637,27 @@ def test_the_unit_of_gyroscopes_is_not_asked_for_where_nothing_tells(turned_by_h
         n: replace(p, value=57.29577951 * p.value) if "gyro_scale" in n else p for n, p in made.parameters.items()
     }
     assert warn_of_unit(loaded(replace(made, parameters=scaled)), wrong) == []
+
+
+def test_readings_that_are_lost_or_beyond_the_test_are_said_by_command_and_function(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    truth, _, outputs = simulated(2, "m/s^2")
+    outputs *= 0.3
+    outputs[50, 1], outputs[20:22, 0], outputs[90, 0], outputs[:, 2] = 40.0, np.inf, -np.inf, np.nan
+    made, held = record(truth, 2, "m/s^2"), recording(outputs, "m/s^2", gyro_x=(np.full(200, np.inf), "rad/s"))
+    force = (40.0 / truth["scale_factor_y"] - truth["bias_y"]) / G
+    lost = "what is corrected with it is not a number there"
+    lines = [
+        f"flight.csv: 1 samples beyond 2 g (up to {force:.1f} g): the record's nonlinearity was measured within 1 g",
+        f"flight.csv: row 21 (line 23), column accel_x: expected a number, found inf (and 2 more): {lost}",
+        f"flight.csv: column accel_z: expected numbers, found none in 200 rows: {lost}",
+    ]
+    assert list(il.apply(made, held).notes) == lines
+    blocks = DoubtfulSamples([made], [loaded(made)])
+    for start in range(0, 200, 7):
+        blocks.add(replace(recording(outputs[start : start + 7], "m/s^2"), first_row=start + 1))
+    assert blocks.warnings() == lines
+    made.save("r.json")
+    write(replace(held, metadata={"a": "1"}), "flight.csv")  # its row 21 is line 23
+    assert main(["apply", "r.json", "flight.csv", "-o", "c.csv", "--quiet"]) == 0
+    assert capsys.readouterr().err.splitlines() == [f"imulab: warning: {line}" for line in lines]

@@ -29,7 +29,7 @@ from imulab.cli.options import (
     warn,
     with_notes,
 )
-from imulab.errors import ImulabError, OptionError, RecordError
+from imulab.errors import OptionError, RecordError, listed
 from imulab.files import open_file
 from imulab.options import OUTPUT
 
@@ -211,20 +211,14 @@ class _Rows:
 def _with_warnings(
     records: list[Calibration | Blob], chain: Sequence[Loaded], blocks: Iterable[Recording]
 ) -> Iterator[Recording]:
-    """Yield blocks; print warnings after the first, and at the end what lay beyond the test."""
+    """Yield blocks; print warnings after the first, and at the end which samples are doubtful."""
     from imulab.display import Note, prefixed
-    from imulab.procedures.apply import list_earlier, list_results, warn_before_applying, warn_of_unit
+    from imulab.procedures.apply import DoubtfulSamples, list_earlier, warn_before_applying, warn_of_unit
     from imulab.recording import TAKEN_FROM
 
-    tests = list_results(records)
-    counts, largest, name = [0] * len(tests), [0.0] * len(tests), ""
+    samples = DoubtfulSamples(records, chain)
     for number, block in enumerate(blocks):
-        for index, (record, procedure) in enumerate(tests):
-            try:
-                here, most = procedure.beyond(record, block)
-            except ImulabError:  # what only an earlier record of the chain makes usable; apply itself refuses the rest
-                continue
-            counts[index], largest[index], name = counts[index] + here, max(largest[index], most), block.name
+        samples.add(block)
         yield block
         if number == 0:  # after it was corrected: where it is refused, the refusal is the one line there is
             messages = [message for record in records for message in warn_before_applying(record, block)]
@@ -234,9 +228,8 @@ def _with_warnings(
             messages += [prefixed(block.name, doubt) for doubt in doubts]
             for message in dict.fromkeys(messages):
                 warn(message)
-    for (record, procedure), count, most in zip(tests, counts, largest, strict=True):
-        if count:
-            warn(f"{name}: {procedure.beyond_message(record, count, most)}")
+    for message in samples.warnings():
+        warn(message)
 
 
 def show(
@@ -310,7 +303,7 @@ def _show_formats(names: list[str], *, json: bool) -> None:
     for name in names:
         path = shipped_file(name)
         if path is None:
-            raise OptionError(f"show --formats {name}: expected the name of a layout: {' '.join(shipped_names())}")
+            raise OptionError(f"show --formats {name}: expected the name of a layout: {listed(shipped_names(), name)}")
         tables[name] = load_toml(path, name, "layout")
         if not json:
             print(path.read_text(encoding="utf-8").rstrip("\n"))

@@ -10,11 +10,13 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Annotated, Any, Unpack
 
-from imulab.columns import KINDS, triad
+import numpy as np
+
+from imulab.columns import INERTIAL, KINDS, kind_of, triad
 from imulab.device.tables import DeviceTable, Fusion
 from imulab.device.unit import Blob, DeviceUnit
 from imulab.display import SENTENCES, Note
-from imulab.errors import DataError, OptionError, RecordError, listed
+from imulab.errors import DataError, ImulabError, OptionError, RecordError, first_of, listed
 from imulab.estimation.likely_unit import MOST_SAMPLES, doubt_by_correction, doubt_rates
 from imulab.estimation.sampling import whole_where_shared
 from imulab.options import choice, measure
@@ -220,7 +222,8 @@ def apply(
     and those of the records in it. A recording that the same record corrected before is refused, unless `again`. Its
     `notes` say what the command warns of: a record whose verdict is *bad*, or of another unit or temperature, a triad
     that is missing, accelerometers that are probably in another unit than stated, and other records that corrected the
-    recording's file, whose errors are not known.
+    recording's file, whose errors are not known; samples beyond the range of the record's test, infinite ones, and
+    columns without a number.
 
     Parameters
     ----------
@@ -310,7 +313,9 @@ def apply(
     if not isinstance(record, Loaded):  # the command line says it of the first block
         earlier = map(Note, list_earlier(recording))  # as it may have to be: a later fit is not doubted for it
         doubts = [*warn_before_applying(record, recording), *warn_of_unit(ready, recording)]
-        notes = tuple(dict.fromkeys([*notes, *doubts, *earlier]))
+        samples = DoubtfulSamples([record], [ready])
+        samples.add(recording)
+        notes = tuple(dict.fromkeys([*notes, *doubts, *earlier, *samples.warnings()]))
     by = (*recording.corrected_by, *_name_corrections(ready, active))
     return replace(corrected, corrected_by=by, notes=notes)
 
@@ -431,6 +436,58 @@ def warn_of_unit(ready: Loaded, recording: Recording) -> list[str]:
             corrected = each.apply(ready.unit, its, corrected)
         doubts.append(doubt_rates(corrected))
     return [doubt for doubt in doubts if doubt]
+
+
+class DoubtfulSamples:
+    """Samples of a recording that records correct by extrapolation, or not at all, counted over its blocks."""
+
+    def __init__(self, records: Iterable[Calibration | Blob], chain: Iterable[Loaded]) -> None:
+        self._tests = list_results(records)
+        self._beyond, self._largest = [0] * len(self._tests), [0.0] * len(self._tests)
+        triads = {part.triad for ready in chain for part, _ in ready.sections}
+        self._sensors = {*INERTIAL, "mag"} if "" in triads else triads
+        self._name, self._rows = "", 0
+        self._finite: dict[str, bool] = {}
+        self._infinite: dict[str, tuple[str, int]] = {}
+
+    def add(self, block: Recording) -> None:
+        """Take in the next block, as it was measured."""
+        self._name, self._rows = block.name, self._rows + len(block)
+        for index, (record, procedure) in enumerate(self._tests):
+            try:
+                here, most = procedure.beyond(record, block)
+            except ImulabError:  # what only an earlier record of the chain makes usable; apply itself refuses the rest
+                continue
+            self._beyond[index] += here
+            self._largest[index] = max(self._largest[index], most)
+        for column, values in block.columns.items():
+            if kind_of(column) not in self._sensors:
+                continue
+            self._finite[column] = self._finite.get(column, False) or bool(np.isfinite(values).any())
+            if (infinite := np.flatnonzero(np.isinf(values))).size:
+                found = f"{block.place(infinite[0])}, column {column}: expected a number, found {values[infinite[0]]}"
+                first, before = self._infinite.get(column, (found, 0))
+                self._infinite[column] = first, before + infinite.size
+
+    def warnings(self) -> list[str]:
+        """Return a sentence on each kind of them."""
+        messages = [
+            f"{self._name}: {procedure.beyond_message(record, count, largest)}"
+            for (record, procedure), count, largest in zip(self._tests, self._beyond, self._largest, strict=True)
+            if count
+        ]
+        for first, count in self._infinite.values():
+            more = f" (and {count - 1} more)" if count > 1 else ""
+            messages.append(f"{self._name}: {first}{more}: {_NOT_CORRECTED}")
+        if self._rows and (lost := [column for column, finite in self._finite.items() if not finite]):
+            where = f"{'columns' if len(lost) > 1 else 'column'} {first_of(lost, 3)}"
+            messages.append(
+                f"{self._name}: {where}: expected numbers, found none in {self._rows} rows: {_NOT_CORRECTED}"
+            )
+        return messages
+
+
+_NOT_CORRECTED = "what is corrected with it is not a number there"
 
 
 def list_results(records: Iterable[Calibration | Blob]) -> list[tuple[Calibration, Procedure]]:
