@@ -253,6 +253,18 @@ def test_another_instruments_file_gives_what_our_own_gives(imulab, tmp_path, rec
         )
 
 
+@pytest.mark.parametrize(
+    "command", ["report t.json -o", "tumble fit t.csv --gravity 9.81 -o s.json --report", "fleet report . -o"]
+)
+def test_a_report_is_html(imulab, tmp_path, recording, command):
+    il.write_csv(recording, tmp_path / "t.csv")
+    il.fit_tumble(recording, gravity=9.81, order=1).calibration.save(tmp_path / "t.json")
+    done = imulab(*command.split(), "r.txt")
+    assert done.returncode == 2
+    assert done.stderr == "imulab: r.txt: a report is HTML; expected a name that ends in .html\n"
+    assert {each.name for each in tmp_path.iterdir()} == {"t.csv", "t.json"}
+
+
 @pytest.mark.parametrize("name", ["sheet.pdf", "picture.PNG"])
 def test_a_report_is_no_paper(imulab, tmp_path, recording, name):
     il.write_csv(recording, tmp_path / "t.csv")

@@ -44,6 +44,10 @@ WRONG = {
     ),
     "save to a number": (lambda r, f: f.save(3), NO_FILE + "3"),
     "save a record to nothing": (lambda r, f: f.calibration.save(None), NO_FILE + "None"),
+    "report as text": (
+        lambda r, f: f.report("r.txt"),
+        r"r\.txt: a report is HTML; expected a name that ends in \.html",
+    ),
     "report as a printed page": (lambda r, f: f.report("r.pdf"), r"r\.pdf: no such file is written; reports are HTML"),
     "sheet as a picture": (
         lambda r, f: il.plan_tumble(attitudes=12, order=1, noise="20 ug").report("s.png"),

@@ -373,7 +373,14 @@ def test_the_check_report_says_pass_or_fail_first(imulab, tmp_path, gravity, ver
 
 
 @pytest.mark.parametrize("command", [("allan", "x.csv"), ("tumble", "check", "r.json", "x.csv")])
-@pytest.mark.parametrize(("report", "words"), [("x.csv", "would overwrite x.csv"), ("r.pdf", "reports are HTML")])
+@pytest.mark.parametrize(
+    ("report", "words"),
+    [
+        ("x.csv", "would overwrite x.csv"),
+        ("r.pdf", "reports are HTML"),
+        ("r.txt", "r.txt: a report is HTML; expected a name that ends in .html"),
+    ],
+)
 def test_a_report_takes_the_place_of_no_input(imulab, tmp_path, command, report, words):
     (tmp_path / "x.csv").write_text(still())
     done = imulab(*command, "--report", report)

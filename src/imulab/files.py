@@ -101,9 +101,16 @@ def check_no_paper(path: str | Path) -> None:
         raise OptionError(f"{path}: no such file is written; reports are HTML (.html), which any browser prints")
 
 
-def write_page(path: str | Path, page: str) -> None:
-    """Write an HTML page; errors as for `write_text` and `check_no_paper`."""
+def check_page(path: str | Path) -> None:
+    """Refuse the name of a file that promises something else than an HTML page; errors as for `check_no_paper`."""
     check_no_paper(path)
+    if Path(path).suffix.lower() not in (".html", ".htm") and not Path(path).is_dir():
+        raise OptionError(f"{path}: a report is HTML; expected a name that ends in .html")
+
+
+def write_page(path: str | Path, page: str) -> None:
+    """Write an HTML page; errors as for `write_text` and `check_page`."""
+    check_page(path)
     write_text(path, page)
 
 

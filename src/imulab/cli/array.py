@@ -386,7 +386,7 @@ def compare(
     calibration = options["calibration"]
     if (file is None) == (experiment is None):
         raise OptionError("array compare: expected FILE, or --experiment static|dynamic")
-    check_outputs([output, report], [name for name in (file, calibration, options["layout"]) if name])
+    check_outputs([output], [name for name in (file, calibration, options["layout"]) if name], report=report)
     how = reading(options)
     count = whole_number(seeds, "--seeds")
     if experiment is not None:
@@ -438,7 +438,7 @@ def compare_imus(
     from imulab.report.traces import ReportTable
 
     calibration = options["calibration"]
-    check_outputs([report], [name for name in (file, options["layout"], calibration) if name])
+    check_outputs([], [name for name in (file, options["layout"], calibration) if name], report=report)
     recording = one_clock(read_recording(file, **with_all_instances(file, reading(options))))
     compared = call(il.compare_imus, recording, **options)
     verdict, exhibits = verdict_of(compared.notes), compared.exhibits()

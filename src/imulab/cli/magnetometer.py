@@ -74,7 +74,7 @@ def check(
     from imulab.errors import RecordError
     from imulab.procedures.registry import load
 
-    check_outputs([report], [name for name in (record, file, options["layout"]) if name])
+    check_outputs([], [name for name in (record, file, options["layout"]) if name], report=report)
     held = load(record)
     recording = read_recording(file, **reading(options))
     try:

@@ -49,7 +49,7 @@ def allan(file: RecordingFile, *, report: ReportFile = None, json: AsJson = Fals
     from imulab.readers import read, read_blocks
     from imulab.recording import is_large, on_disk
 
-    check_outputs([report], [name for name in (file, options["layout"]) if name])
+    check_outputs([], [name for name in (file, options["layout"]) if name], report=report)
     how = reading(options)
     recording = on_disk(read_blocks(file, **how)) if is_large(file) else read(file, **how)
     with labelled("--{}", ["taus"]):
@@ -142,7 +142,7 @@ def fit(
     if keys_file is None:
         check_record_outputs(output, report, inputs)
     else:
-        check_outputs([output, report], inputs)
+        check_outputs([output], inputs, report=report)
     hertz = None if rate is None else quantity(rate, "--rate", "frequency", "Hz")
     seconds = None if step is None else quantity(step, "--step", "time", "s")
     if program is not None:
@@ -235,7 +235,7 @@ def check(
     from imulab.procedures.procedure import source_of
     from imulab.procedures.registry import load
 
-    check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
+    check_outputs([], [name for name in (record, *files, options["layout"]) if name], report=report)
     held = load(record)
     access, how = GivenFiles(), reading(options)
     tolerance, false_alarm = options["tolerance"], options["false_alarm"]

@@ -253,20 +253,22 @@ class GivenFiles:
         return str(path)
 
 
-def check_outputs(outputs: list[str | None], inputs: list[str], *, paper: bool = False) -> None:
+def check_outputs(
+    outputs: list[str | None], inputs: list[str], *, report: str | None = None, paper: bool = False
+) -> None:
     """Refuse, before the work, an output without a folder, or one that is an input or another output.
 
-    `paper` says that the command writes printed pages.
+    `report` is the output that is an HTML page; `paper` says that the command writes printed pages.
 
     Raises
     ------
     OptionError
         An output cannot be written, or would overwrite another file of this command.
     """
-    from imulab.files import check_no_paper, real_path
+    from imulab.files import check_no_paper, check_page, real_path
 
     taken = {Path(os.path.realpath(name)): name for name in inputs if name != "-"}
-    for name in outputs:
+    for name in (*outputs, report):
         if name is None:
             continue
         if name == "-":
@@ -279,6 +281,8 @@ def check_outputs(outputs: list[str | None], inputs: list[str], *, paper: bool =
         if not target.parent.is_dir():
             raise OptionError(f"{name}: cannot be written: no such folder")
         taken[target] = name
+    if report is not None:
+        check_page(report)
 
 
 NO_RECORD = (".html", ".htm", ".csv", ".parquet", ".yaml", ".yml", ".toml", ".txt", ".params", ".param")
@@ -293,7 +297,7 @@ def check_record_outputs(output: str | None, report: str | None, inputs: list[st
     OptionError
         See above.
     """
-    check_outputs([*others, output, report], inputs)
+    check_outputs([*others, output], inputs, report=report)
     if output is not None and (path := Path(output)).suffix.lower() in NO_RECORD:
         page = f"; --report {output} writes a page" if path.suffix.lower() in (".html", ".htm") else ""
         raise OptionError(f"{output}: a record is JSON; expected a name such as {path.with_suffix('.json')}{page}")

@@ -347,7 +347,7 @@ def report(
     from imulab.procedures.registry import load
     from imulab.procedures.views import write_report
 
-    check_outputs([output], [file])
+    check_outputs([], [file], report=output)
     write_report(load(file), output)
     print(f"report: {output}")
 

@@ -85,7 +85,7 @@ def run(*, output: str | None, report: str | None, json: bool, **options: Any) -
 
 def check_plan_outputs(output: str | None, report: str | None, inputs: list[str]) -> None:
     """Check before the work that the plan can be written; errors as for `check_outputs`."""
-    check_outputs([output, report], inputs)
+    check_outputs([output], inputs, report=report)
     if output is not None and not output.lower().endswith(".csv"):
         raise OptionError(f"{output}: expected a name that ends in .csv")
 

@@ -106,7 +106,7 @@ def check(
     from imulab.errors import RecordError
     from imulab.procedures.registry import load
 
-    check_outputs([report], [name for name in (record, *files, options["layout"]) if name])
+    check_outputs([], [name for name in (record, *files, options["layout"]) if name], report=report)
     held = load(record)
     how = reading(options)
     recordings = [read_recording(file, **how) for file in files]

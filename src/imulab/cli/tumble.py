@@ -191,7 +191,7 @@ def check(
     from imulab.procedures.tumble.attitudes import find_attitudes
     from imulab.procedures.tumble.check import check_tumble
 
-    check_outputs([report], [name for name in (record, file, options["layout"]) if name])
+    check_outputs([], [name for name in (record, file, options["layout"]) if name], report=report)
     held = load(record)
     latitude, height = of_place(options["place"], options["gravity"], options["latitude"], options["height"], FLAG)
     local = gravity_option(options["gravity"], latitude, height, FLAG, beside=options["place"] is not None)

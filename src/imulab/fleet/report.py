@@ -11,7 +11,7 @@ from typing import Annotated
 
 from imulab.arguments import Folder
 from imulab.errors import OptionError, first_of
-from imulab.files import write_text
+from imulab.files import write_page
 from imulab.fleet import figures
 from imulab.fleet.engine import Summary
 from imulab.fleet.history import History, open_history
@@ -82,7 +82,7 @@ def write_fleet_report(
         ("records made", " to ".join(sorted({min(s.created for s in summaries), max(s.created for s in summaries)}))),
         ("software", ", ".join(sorted({summary.software for summary in summaries}))),
     ]
-    write_text(
+    write_page(
         output,
         render_page("Fleet", Path(folder).name, exhibits, provenance=provenance, notes=_warnings(state)),
     )
