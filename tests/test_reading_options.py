@@ -178,6 +178,7 @@ def test_units_are_stated_on_the_command_line_and_in_python(run, tmp_path):
     assert [blocks[0].units[f"accel_{axis}"] for axis in "xyz"] == ["m/s^2", "mg", "m/s^2"]
     for words, message in (
         ("gyr=deg/s", "unit of gyr: no such column; columns: time accel_x"),
+        ("accle=g", "; did you mean 'accel'?"),
         ("accel=deg/s", "column accel_x: expected a unit of acceleration or output, found 'deg/s' (rate)"),
         ("accel", "--unit 'accel': expected NAME=UNIT, each name once, such as accel=g,gyro=deg/s"),
         ("accel=gee", "--unit accel=gee: unknown unit 'gee'"),

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from imulab.arguments import checked, described
 from imulab.columns import check_unit, clocks_of, element_number, expected_quantities, kind_of, shared_unit, triad
 from imulab.display import Note, has_hidden, printable, reverses
-from imulab.errors import DataError, OptionError, UnitError, several
+from imulab.errors import DataError, OptionError, UnitError, meant, several
 from imulab.frames import Frame, columns_of_arrays, columns_of_frame, data_frame
 from imulab.options import PROGRAM, READING, choice, file, parsed, text
 from imulab.quantities import LARGEST, parse_units, span, whole, whole_number
@@ -929,7 +929,7 @@ def instance_number(value: int | str, called: str) -> int | str:
     try:
         number = whole(value, called)
     except OptionError as error:
-        raise OptionError(f"{error}, or {EVERY}") from None
+        raise OptionError(f"{error}, or {EVERY}{meant([EVERY], value)}") from None
     if number < 0:
         raise OptionError(f"{called} {number}: expected a number from 0")
     return number

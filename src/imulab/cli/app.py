@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,12 @@ def _names(group: str) -> list[str]:
 
 
 def _no_command(word: str, group: str) -> OptionError:
-    return OptionError(f"No such command '{word}'; known commands: {listed(_names(group), word)}")
+    known = _names(group)
+    second = {} if group else {name: _names(name) for name in known}
+    if begun := [f"{name} {word}" for name, names in second.items() if word in names]:
+        return OptionError(f"No such command '{word}'; expected one of {', '.join(begun)}")
+    near = meant([*known, *chain.from_iterable(second.values())], word)
+    return OptionError(f"No such command '{word}'; known commands: {' '.join(known)}{near}")
 
 
 def _answered(group: str, words: list[str]) -> bool:

@@ -28,7 +28,7 @@ from imulab.cli.options import (
 )
 from imulab.device import STARTS
 from imulab.display import aligned
-from imulab.errors import OptionError
+from imulab.errors import OptionError, meant
 from imulab.options import OUTPUT
 from imulab.procedures.gyro_array import OF_THE_SOURCE
 
@@ -327,7 +327,9 @@ def _load(name: str, option: str) -> Calibration:
     from imulab.procedures.registry import load
 
     if option == "--initial-bias" and not Path(name).exists():
-        raise OptionError(f"--initial-bias {name!r}: expected first, zero, or the file of a record")
+        raise OptionError(
+            f"--initial-bias {name!r}: expected first, zero, or the file of a record{meant(['first', 'zero'], name)}"
+        )
     record = load(name)
     check_calibration(record, name)
     return record

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from imulab.cli.command import HELP, HELP_ALL, Command
-from imulab.errors import OptionError
+from imulab.errors import OptionError, meant
 
 ASKED = "_IMULAB_COMPLETE"
 _SCRIPTS = {
@@ -73,7 +73,7 @@ def script(shell: str) -> str:
         It is a shell that cannot.
     """
     if shell not in _SCRIPTS:
-        raise OptionError(f"shell {shell or 'unknown'}: expected one of {' '.join(_SCRIPTS)}")
+        raise OptionError(f"shell {shell or 'unknown'}: expected one of {' '.join(_SCRIPTS)}{meant(_SCRIPTS, shell)}")
     return _SCRIPTS[shell]
 
 

@@ -16,7 +16,17 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
-from imulab.errors import ImulabError, OptionError, ReadError, folder_in_place, install, listed, readable, several
+from imulab.errors import (
+    ImulabError,
+    OptionError,
+    ReadError,
+    folder_in_place,
+    install,
+    listed,
+    meant,
+    readable,
+    several,
+)
 from imulab.procedures.registry import PROCEDURES
 from imulab.readers.formats import library
 
@@ -408,7 +418,7 @@ def _check_columns(titles: Sequence[str], procedures: Set[str], name: str) -> No
                 raise OptionError(
                     f"{name}: columns are separated by {separator!r}; expected commas (';' only between a unit's files)"
                 )
-            raise OptionError(f"{name}: no column {title}; found {several(titles)}")
+            raise OptionError(f"{name}: no column {title}; found {several(titles)}{meant(titles, title)}")
     usual = {*COLUMNS, *_options_of(PROCEDURES[key] for key in procedures & PROCEDURES.keys())}
     for index, title in enumerate(titles):
         if title.replace("-", "_") not in usual:

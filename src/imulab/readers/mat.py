@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from imulab.errors import ReadError
+from imulab.errors import ReadError, listed
 from imulab.files import open_file
 from imulab.readers.arrays import floats_of_rows, origins, recordings, sliced
 from imulab.readers.formats import Budget, unpack
@@ -98,7 +98,7 @@ def _numbers(variables: dict[str, _Variable], path: str, where: str) -> np.ndarr
         if inside is None:
             raise ReadError(f"{where}, found no struct")
         if part not in inside:
-            raise ReadError(f"{where}, found {' '.join(inside) or 'no variables'}")
+            raise ReadError(f"{where}, found {listed(inside, part) or 'no variables'}")
         variable = inside[part]
         inside = variable.fields
     if variable.numbers is None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from imulab.columns import kind_of, measured, parse_column_title
 from imulab.display import Note
-from imulab.errors import ReadError
+from imulab.errors import ReadError, listed
 from imulab.files import within
 from imulab.readers.arrays import ROWS, origins, to_floats
 from imulab.readers.formats import Budget, library
@@ -102,7 +102,9 @@ def _columns(
     for key, (title, number) in origins(layout, name, "Parquet").items():
         title = title if number is None else f"{title}[{number}]"
         if there.count(title) != 1:
-            raise ReadError(f"{name}: {layout.name} takes {key} from a column named {title!r}, found {' '.join(there)}")
+            raise ReadError(
+                f"{name}: {layout.name} takes {key} from a column named {title!r}, found {listed(there, title)}"
+            )
         columns[key] = title
     return columns, layout.units
 

@@ -10,7 +10,7 @@ import numpy as np
 from imulab.arguments import check_fields
 from imulab.columns import check_unit, element_number, kind_of, stated_unit
 from imulab.display import Note
-from imulab.errors import OptionError, listed
+from imulab.errors import OptionError, listed, meant, several
 from imulab.quantities import FromStart, span
 from imulab.recording import DAMAGED, EVERY, Array, Ends, Recording, Window, instance_number, packed
 from imulab.units import parse_unit
@@ -147,11 +147,14 @@ def with_units(blocks: Iterator[Recording], units: Mapping[str, str] | None, nam
 def units_of_columns(columns: Iterable[str], units: Mapping[str, str], name: str) -> dict[str, str]:
     """Return the units that a caller states by column; errors as for `with_units`."""
     columns = list(columns)
-    unused = [key for key in units if not any(key in (column, kind_of(column)) for column in columns)]
+    names = dict.fromkeys(name for column in columns for name in (column, kind_of(column)) if name)
+    unused = [key for key in units if key not in names]
     if isinstance(units, SharedUnits):
         units.unused = [key for key in units.unused if key in unused]
     elif unused:
-        raise OptionError(f"{name}: unit of {unused[0]}: no such column; columns: {listed(columns, unused[0])}")
+        raise OptionError(
+            f"{name}: unit of {unused[0]}: no such column; columns: {several(columns)}{meant(names, unused[0])}"
+        )
     stated = {column: parse_unit(unit).symbol for column in columns if (unit := stated_unit(column, units))}
     for column, unit in stated.items():
         check_unit(column, unit, name)

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Struct
 
 from imulab.columns import KINDS, kind_of, triad
-from imulab.errors import OptionError, ReadError, quoted
+from imulab.errors import OptionError, ReadError, listed, quoted
 from imulab.estimation.rows import median
 from imulab.readers.formats import TEXT, recognised
 from imulab.readers.guess import (
@@ -168,7 +168,7 @@ def layout_of_columns(table: Table, chosen: Mapping[int, tuple[str, str]], sampl
     for place, (column, unit) in chosen.items():
         title = table.titles[place].strip() if 0 <= place < len(table.titles) else ""
         if not title or kind_of(column) is None:
-            raise OptionError(f"{name}: column {place + 1} {quoted(column)}: expected one of {' '.join(KINDS)}")
+            raise OptionError(f"{name}: column {place + 1} {quoted(column)}: expected one of {listed(KINDS, column)}")
         if column in places:
             raise OptionError(
                 f"{column} is chosen for two columns: {quoted(table.titles[places[column]])} and {quoted(title)}"

@@ -24,7 +24,7 @@ from msgspec import Struct
 import imulab.readers._text as _text
 from imulab.columns import kind_of, measured, parse_column_title
 from imulab.display import Finding, Note
-from imulab.errors import ReadError, several
+from imulab.errors import ReadError, meant, several
 from imulab.readers.formats import packed_by
 from imulab.readers.labelled import LabelledLines
 from imulab.readers.layout import BackwardsError, Readings
@@ -694,7 +694,7 @@ class TextFile:
         )
         raise ReadError(
             f"{self._name}: {layout.name} takes {name} from a column named {origin!r}, "
-            f"found {several(best) or 'no titles'}"
+            f"found {several(best) or 'no titles'}{meant(best, origin)}"
         )
 
     # --- rows --------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.recording import Array
 
 _BLOCK = 1 << 17  # samples drawn together; it bounds memory, and the drawn numbers depend on it
@@ -61,7 +61,7 @@ def simulated(values: Mapping[str, float], interval: float, count: int, seed: in
 def _check(values: Mapping[str, float], interval: float, count: int) -> None:
     for name, value in values.items():
         if name not in TERMS:
-            raise OptionError(f"noise term {name!r}: expected one of {' '.join(TERMS)}")
+            raise OptionError(f"noise term {name!r}: expected one of {listed(TERMS, name)}")
         if not math.isfinite(value) or (value < 0 and name != "ramp"):
             raise OptionError(f"noise term {name}: {value:g}; expected a size, zero or more")
     for k in (1, 2):

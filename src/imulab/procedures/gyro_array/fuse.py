@@ -19,7 +19,7 @@ from imulab.device import METHODS, STARTS
 from imulab.device.tables import MOST_COUNT, ArraySettings, Fusion, fusion_of
 from imulab.device.unit import Blob
 from imulab.display import Bad, Finding, prefixed
-from imulab.errors import DataError, OptionError, RecordError, UnitError, listed
+from imulab.errors import DataError, OptionError, RecordError, UnitError, listed, meant
 from imulab.estimation.rows import HISTORY, MAD_TO_SIGMA, zero_rows
 from imulab.procedures.gyro_array.elements import (
     EXCLUDED,
@@ -414,7 +414,7 @@ def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]
     except ValueError:
         gain = np.nan
     if not 0 < gain < 1:
-        raise OptionError(f"{option} {text!r}: expected growing, growing:COUNT, or a gain between 0 and 1")
+        raise OptionError(f"{option} {text!r}: {_MEMORIES}{meant(['growing'], kind)}")
     return gain, 1
 
 
@@ -423,6 +423,7 @@ def parse_memory(text: str, option: str = "--memory") -> tuple[str | float, int]
 
 _NEED_THREE = ("robust", "support", "least-squares")
 _MISALIGNED = 0.3  # of a reading: noise of the first element, which explains so much of the others, makes less
+_MEMORIES = "expected growing, growing:COUNT, or a gain between 0 and 1"
 _FOR_NOISE = 10_000  # samples that show the noise where none is stated
 _FOR_SCALE = 1000  # samples whose noise and means are compared with a record's
 _NEAR_BIASES = 4.0  # times: the ratio of biases may be as far off that of noise
@@ -475,9 +476,9 @@ class FuseOptions:
             raise OptionError(f"method {self.method!r}: expected one of {listed(METHODS, self.method)}")
         if isinstance(self.memory, str):
             if self.memory != "growing":
-                raise OptionError(f"memory {self.memory!r}: expected growing, growing:COUNT, or a gain between 0 and 1")
+                raise OptionError(f"memory {self.memory!r}: {_MEMORIES}{meant(['growing'], self.memory)}")
         elif not 0 < self.memory < 1:
-            raise OptionError(f"memory {self.memory:g}: expected growing, growing:COUNT, or a gain between 0 and 1")
+            raise OptionError(f"memory {self.memory:g}: {_MEMORIES}")
         if not 1 <= self.start <= MOST_COUNT:
             raise OptionError(f"memory growing:{self.start}: expected a count from 1 to {MOST_COUNT}")
         if isinstance(self.initial_bias, str) and self.initial_bias not in STARTS:

@@ -232,8 +232,8 @@ def _check(elements: int, axes: int, rate: float, length: float, mounting: str, 
         raise OptionError(f"axes {axes}: expected 1 or 3")
     if mounting not in MOUNTINGS:
         raise OptionError(f"mounting {mounting!r}: expected one of {listed(MOUNTINGS, mounting)}")
-    if parse_unit(unit).quantity != "rate":
-        raise OptionError(f"unit {unit}: expected {' '.join(UNITS)}")
+    if parse_unit(unit, ("rate",)).quantity != "rate":
+        raise OptionError(f"unit {unit}: expected {listed(UNITS, unit)}")
 
 
 def _check_numbers(noise: NoiseModel, scale_spread: float, misalignment: float, session: int, seed: int) -> None:

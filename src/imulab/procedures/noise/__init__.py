@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from imulab.errors import OptionError, listed
+from imulab.errors import OptionError, listed, meant
 from imulab.estimation.decisions import NOISE_MODEL_REJECTED
 
 HORIZON = 10.0
@@ -35,6 +35,7 @@ def check_terms(text: str, called: str = "terms") -> str:
         known = ", ".join(f"{letter} {name}" for letter, name in LETTERS.items())
         raise OptionError(
             f"{called} {text!r}: expected auto, or N and any of the others, each once, G up to twice: {known}"
+            f"{meant(['auto'], text)}"
         )
     return text
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, meant
 
 LAWS = ("cubic", "rough")
 DEGREES = (3, 2, 1)
@@ -38,7 +38,8 @@ def parse_further(text: str | Sequence[str], option: str) -> tuple[str, ...]:
     """
     names = tuple(name.strip() for name in text.split(",")) if isinstance(text, str) else tuple(text)
     if not set(names) <= {"gyro"} or len(names) > 1:
-        raise OptionError(f"{option} {','.join(names)!r}: expected gyro")
+        text = ",".join(names)
+        raise OptionError(f"{option} {text!r}: expected gyro{meant(['gyro'], text)}")
     return names
 
 
@@ -73,6 +74,7 @@ def parse_laws(text: str, option: str) -> tuple[str | tuple[int, int, int], bool
         raise OptionError(
             f"{option} {text!r}: expected auto, or the degrees of bias, scale factor and misalignment, 0 to {HIGHEST}, "
             "such as 3,2,1, or spline,2,1 for a bias with a knot at each temperature"
+            f"{meant(['auto', 'spline'], parts[0])}"
         )
     return (int(degrees[0]), int(degrees[1]), int(degrees[2])), spline
 

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from imulab.display import Note
-from imulab.errors import DataError, ObservabilityError, OptionError, first_of, listed
+from imulab.errors import DataError, ObservabilityError, OptionError, first_of, listed, meant
 from imulab.estimation.least_squares import Observability, huber_inflation, observability
 from imulab.gravity import Gravity
 from imulab.procedures.tumble import FROM_DATA, FURTHER, HIGHEST_ORDER, LOSSES, METHODS
@@ -179,7 +179,7 @@ def further_triads(triads: str | Sequence[str], called: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in triads.split(",")) if isinstance(triads, str) else tuple(triads)
     for name in names:
         if name not in FURTHER:
-            raise OptionError(f"{called} {name!r}: expected gyro, mag or both, as in gyro,mag")
+            raise OptionError(f"{called} {name!r}: expected gyro, mag or both, as in gyro,mag{meant(FURTHER, name)}")
     if len(set(names)) < len(names):
         raise OptionError(f"{called} {','.join(names)}: expected each triad once")
     return names

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from imulab.columns import triad
-from imulab.errors import DataError, ImulabError, ObservabilityError, OptionError, RecordError, UnitError, listed
+from imulab.errors import DataError, ImulabError, ObservabilityError, OptionError, RecordError, UnitError, listed, meant
 from imulab.estimation.least_squares import observability
 from imulab.options import choice, either, file, parsed, text
 from imulab.procedures.registry import load
@@ -653,7 +653,7 @@ def plan_tumble(
     number = whole(SOURCE_ORDER if method == "linearised" else 3, "order") if order is None else whole(order, "order")
     check_method(method, number)
     if with_ not in (None, "mag"):
-        raise OptionError(f"with_ {with_!r}: expected mag: only magnetometers ask for headings")
+        raise OptionError(f"with_ {with_!r}: expected mag: only magnetometers ask for headings{meant(['mag'], with_)}")
     sigma, source = noise_of(noise)
     distinct = method == "linearised" if distinct_verticals is None else distinct_verticals
     chosen = plan_attitudes(

@@ -223,7 +223,7 @@ def _spread(count: int, rng: np.random.Generator) -> Array:
 
 
 def _nominal_scale(unit: str, scale: float | None) -> float:
-    known = parse_unit(unit)
+    known = parse_unit(unit, ("acceleration", "output"))
     if known.quantity == "acceleration":
         return conversion_factor("m/s^2", known.symbol)
     if known.quantity != "output":

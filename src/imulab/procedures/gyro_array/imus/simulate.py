@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, listed
 from imulab.options import choice, measure
 from imulab.quantities import in_si, whole
 from imulab.recording import Array, Recording
@@ -126,7 +126,7 @@ def simulate_imus(
     length, hertz = in_si(duration, "duration", "time", "s"), in_si(rate, "rate", "frequency", "Hz")
     size, old = in_si(turning, "turning", "rate", "deg/s"), in_si(age, "age", "time", "s")
     if about not in _ABOUT:
-        raise OptionError(f"about {about!r}: expected one of {' '.join(_ABOUT)}")
+        raise OptionError(f"about {about!r}: expected one of {listed(_ABOUT, about)}")
     for what, value, low, high in (
         ("elements", imus, 2, _MOST),
         ("attitudes", attitudes, 1, 100),
