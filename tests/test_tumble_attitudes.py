@@ -317,8 +317,6 @@ def test_attitudes_are_named_by_their_times():
     samples, time, _ = tumble(DIRECTIONS)
     attitudes = find_attitudes(recording(samples, time))
     assert re.fullmatch(r"attitude 2 \(7\.\d to 11\.\d s\)", attitudes.label(1))
-    assert attitudes.times().startswith("0 to 5 s, 7 to 12 s, 14 to 19 s, ")
-    assert attitudes.times().endswith(", ...")
     trace = attitudes.trace
     assert trace.quiet < trace.threshold < np.quantile(trace.variance, 0.95)
     resting = 100 * np.mean(trace.variance <= trace.threshold)

@@ -295,6 +295,7 @@ def test_a_blind_fixture_is_refused_with_the_parameters_it_cannot_separate(direc
     assert f"of the {3 * (order + 2)} parameters of order {order}" in message
     assert named <= set(message.replace(";", " ").split())
     assert "would help most" in message
+    assert len(message.removeprefix("table.csv: ").split()) <= 35
 
 
 def test_the_attitudes_that_would_help_do_help():

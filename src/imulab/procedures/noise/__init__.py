@@ -11,7 +11,13 @@ NO_COVARIATE = "no"
 COVARIATES = ("time", "temperature")
 SAY_STEPS = "say"
 STEPS = (SAY_STEPS, "remove")
-LETTERS = {"N": "white", "B": "1/f", "K": "random walk", "G": "Gauss-Markov", "Q": "quantisation of the angle"}
+LETTERS = {
+    "N": "white noise",
+    "B": "1/f noise",
+    "K": "random walk",
+    "G": "Gauss-Markov noise",
+    "Q": "quantisation of the angle",
+}
 
 
 def rejected(probability: float, columns: int) -> bool:
@@ -38,6 +44,11 @@ def check_terms(text: str, called: str = "terms") -> str:
             f"{meant(['auto'], text)}"
         )
     return text
+
+
+def spelled(letters: str) -> str:
+    """Return a model in words, and its letters: ``white + random walk (NK)``."""
+    return f"{' + '.join(LETTERS[letter] for letter in letters)} ({letters})"
 
 
 def check_options(

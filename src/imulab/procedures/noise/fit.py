@@ -63,6 +63,7 @@ from imulab.procedures.noise import (
     check_options,
     check_terms,
     rejected,
+    spelled,
 )
 from imulab.procedures.noise.schema import term_unit
 from imulab.procedures.result import OWN_CLOCKS, Result, as_blocks, as_recording
@@ -262,7 +263,7 @@ def _describe_column(column: ColumnModel) -> list[str]:
     choice, shortest = analysis.choice, analysis.limits[0]
     near = [analysis.index, *np.flatnonzero(choice.rivals[0]).tolist()]
     models = (letters_inside(choice.models[0, k], choice.values[0, k], shortest) for k in near)
-    chosen, *rivals = dict.fromkeys(models)
+    chosen, *rivals = map(spelled, dict.fromkeys(models))
     if rivals:
         messages.append(Note(f"{chosen} and {', '.join(rivals)} describe the record about equally well"))
     return messages
@@ -305,8 +306,8 @@ def _drift_sentence(drift: CovariateDrift, column: ColumnModel) -> str | None:
     if drift.taken:
         return Note(f"follows the {drift.covariate}, {slope}, which was taken out")
     return Finding(
-        f"follows the {drift.covariate}, {slope}; model {drift.letters[0]}, without that drift {drift.letters[1]} "
-        f"(--regress {drift.covariate})",
+        f"follows the {drift.covariate}, {slope}; model {spelled(drift.letters[0])}, without that drift "
+        f"{spelled(drift.letters[1])} (--regress {drift.covariate})",
         f"fit with --regress {drift.covariate}",
     )
 

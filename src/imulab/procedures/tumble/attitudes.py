@@ -179,11 +179,6 @@ class Attitudes:
             return self.recording.place(int(self.start[index]) - self.recording.first_row)
         return f"attitude {number + 1} ({self.start[index]:.1f} to {self.stop[index]:.1f} s)"
 
-    def times(self) -> str:
-        """Return when the attitudes were found, for a message."""
-        shown = [f"{a:.0f} to {b:.0f} s" for a, b in zip(self.start[:12], self.stop[:12], strict=True)]
-        return ", ".join(shown) + (", ..." if len(self) > 12 else "")
-
     def only(self, kept: NDArray[np.intp]) -> Attitudes:
         """Return some of the attitudes under the labels that they had; the stretches at rest are left out."""
         return replace(

@@ -412,15 +412,13 @@ def _solve(
     if ranks.rank < size:
         names = parameter_names(problem.order, problem.cross)
         confused = ranks.confused(names)
-        shown = first_of(confused, 8, " ")
+        shown = first_of(confused, 6, " ")
         help_from = helpful_attitudes(problem.order, solution, count=2)
-        times = f" (found at {attitudes.times()})" if attitudes.trace is not None and n < size else ""
-        trace = f"; {attitudes.trace.describe()}" if attitudes.trace is not None and n < size else ""
-        many = f"{n} attitudes{times} determine" if n != 1 else f"1 attitude{times} determines"
+        many = f"{n} attitudes determine" if n != 1 else "1 attitude determines"
         raise ObservabilityError(
             f"{attitudes.recording.name}: {many} {ranks.rank} of the {size} parameters of order {problem.order}"
-            f"{untilted(attitudes.mean)}; they cannot separate {shown}{trace}; attitudes with the upward direction "
-            f"near {help_from} would help most"
+            f"{untilted(attitudes.mean)}; they cannot separate {shown}; upward directions {help_from} "
+            "would help most"
         )
     if not solution.converged[0]:
         raise DataError(
