@@ -621,6 +621,24 @@ def test_slow_noise_is_not_taken_for_a_rate_that_is_listed_wrong():
         assert [type(w) for w in record.warnings if "may some of the table's be off" in w] in ([], [Note])
 
 
+def test_a_cubic_bend_that_five_rates_do_not_confirm_is_to_be_looked_at():
+    """200 ppm of the largest rate: S was off by 10 of its standard uncertainties in 1 of 10, verdict good."""
+    five = [0, 100, 200, 100, 0, -100, -200, -100, 0]
+    unsaid, alarms = 0, 0
+    for seed in range(30):
+        k3 = 2e-4 / (200 * DEGREE) ** 2
+        for bend in (0.0, k3):
+            made = recording(way=five, noise=7e-4, powers=([0.0] * 3, [bend] * 3), rng=np.random.default_rng(seed))
+            test = RateTest((Run("z.csv", "+z"),), relative_uncertainty=0.0, latitude=0.0)
+            record = il.fit_rate(RateRecordings(test, (made,), {})).calibration
+            scale = record.parameters["gyro_scale_factor_z"]
+            off = abs(scale.value - SCALE[2]) / scale.standard_uncertainty
+            unsaid += bend > 0 and off > 5 and record.verdict.state == "good"
+            alarms += bend == 0 and record.verdict.state != "good"
+    assert unsaid == 0
+    assert alarms <= 1
+
+
 def test_a_drift_over_time_is_named_and_is_no_asymmetry():
     """1000 ppm and 0.05 deg/s over the run: positive rates, which come first, differ from negative ones."""
     made = recording(way=SEVEN, noise=5e-5, rng=np.random.default_rng(3))

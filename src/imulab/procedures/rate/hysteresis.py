@@ -113,26 +113,53 @@ def fit_loop(
         Which rate and run; middle of the dwell, s; and `find_directions`, shape (n,).
     """
     apart = (direction == 0) & (np.abs(rate) < 1 - 1e-9)  # dwells on a branch that is not known
+    beside = np.column_stack([key[:, None] == np.unique(key), np.eye(len(rate))[:, apart]]).astype(np.float64)
+    shapes = np.column_stack([direction * shape(np.abs(rate)) for shape in _SHAPES])
+    fitted = _fit_shapes(shapes, beside, rate, values, np.diag(variance), runs, time)
+    return None if fitted is None else (fitted[2], (2 * fitted[0], 2 * fitted[1]))
+
+
+def test_bend(
+    rate: Array,
+    values: Array,
+    variance: Array,
+    of_rate: Array,
+    key: NDArray[Any],
+    runs: NDArray[Any],
+    time: Array,
+    order: int,
+) -> float:
+    """Return the probability that noise, scatter, walk and drift alone make the next two powers beyond `order`.
+
+    Parameters are those of `fit_loop`; `of_rate` is the variance that all visits of a rate share, shape (n,).
+    """
+    powers = range(1, min(order + 2, len(np.unique(key)) - 1) + 1)
+    columns = np.column_stack([rate**power for power in powers])
+    noise = np.diag(variance) + (key[:, None] == key) * np.sqrt(np.outer(of_rate, of_rate))
+    fitted = (
+        _fit_shapes(columns[:, order:], columns[:, :order], rate, values, noise, runs, time)
+        if len(powers) > order
+        else None
+    )
+    return 1.0 if fitted is None else fitted[2]
+
+
+def _fit_shapes(
+    shapes: Array, beside: Array, rate: Array, values: Array, noise: Array, runs: NDArray[Any], time: Array
+) -> tuple[float, float, float] | None:
+    """Return `_average_models` of `shapes` beside columns, and a zero and a drift of it in each run; None without."""
     number, which = np.unique(runs, return_inverse=True)
     within = time - np.array([time[runs == run].min() for run in number])[which]
-    nuisance = np.column_stack(
-        [
-            (key[:, None] == np.unique(key)).astype(np.float64),
-            np.eye(len(number))[which],
-            np.eye(len(number))[which] * within[:, None],
-            np.eye(len(rate))[:, apart],
-        ]
-    )
+    of_run = np.eye(len(number))[which]
+    nuisance = np.column_stack([beside, of_run, of_run * within[:, None]])
     free = _null_space((nuisance / np.maximum(np.abs(nuisance).max(axis=0), 1e-300)).T)
-    shapes = free.T @ np.column_stack([direction * shape(np.abs(rate)) for shape in _SHAPES])
+    shapes = free.T @ shapes
     if free.shape[1] < 2 or not (np.sum(shapes**2, axis=0) > 1e-9).all():
         return None
-    free_values = free.T @ values
     walk = np.where(which[:, None] == which, np.minimum(within[:, None], within), 0.0)
     parts = [np.eye(len(rate)), walk, np.outer(within * rate, within * rate)]
-    noise, *parts = (free.T @ part @ free for part in (np.diag(variance), *parts))
-    mean, u, probability = _average_models(noise, parts, shapes, free_values, _GRID if len(rate) < _MANY else _COARSE)
-    return probability, (2 * mean, 2 * u)
+    noise, *parts = (free.T @ part @ free for part in (noise, *parts))
+    return _average_models(noise, parts, shapes, free.T @ values, _GRID if len(rate) < _MANY else _COARSE)
 
 
 def _average_models(
@@ -167,7 +194,7 @@ def _null_space(rows: Array) -> Array:
 def _fit_each(covariances: Array, shapes: Array, values: Array) -> tuple[Array, Array, Array]:
     """Return the coefficient of each shape alone, its standard uncertainty, and the log restricted likelihood.
 
-    For m covariances, shape (m, n, n), and three shapes, shape (n, 3): three arrays of shape (m, 3).
+    For m covariances, shape (m, n, n), and k shapes, shape (n, k): three arrays of shape (m, k).
     """
     lower = np.linalg.cholesky(covariances)
     white = np.linalg.solve(lower, np.column_stack([shapes, values]))

@@ -436,8 +436,12 @@ def _warn_line(
                 "predicts single rates better: may some of the table's be off, or did the zero jump? (--order 2 to 5 "
                 "fits powers all the same)"
             )
-            action = f"compare the rates listed for {axis} with those that the table ran"
-            harmless = line.nonlinearity[0] < known or line.one_rate > LINE_BENDS.level
+            action = (
+                f"compare the rates listed for {axis} with those that the table ran"
+                if line.one_rate < line.bend
+                else f"run more rates about {axis}, or fit with --order 3 if the table's are right"
+            )
+            harmless = line.nonlinearity[0] < known or min(line.one_rate, line.bend) > LINE_BENDS.level
             messages.append(Note(text) if harmless else Finding(text, action))
         if line.kink is not None:
             text = (

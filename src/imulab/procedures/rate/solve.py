@@ -45,6 +45,7 @@ from imulab.procedures.rate.hysteresis import (
     fit_hysteresis,
     fit_loop,
     fit_weighted,
+    test_bend,
     test_one_rate,
     test_visits,
 )
@@ -449,6 +450,8 @@ class Linearity:
         Probability that noise alone leaves such residuals of the line.
     one_rate
         Probability that the rate with the largest residual stands apart from the others by chance, as they scatter.
+    bend
+        Probability that noise, scatter, walk and drift make the next two powers of the rate beyond those chosen.
     by_noise
         Limit that the largest residual stays below with 95 % by noise alone.
     loop
@@ -479,6 +482,7 @@ class Linearity:
     hysteresis: tuple[float, float] | None
     probability: float
     one_rate: float
+    bend: float
     by_noise: float
     loop: float | None
     fitted_loop: tuple[float, float] | None
@@ -507,12 +511,7 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
     drift = None if branch.any() else _fit_drift(rate, values, variance, key, runs, problem.time, on_axis)
     values = values if drift is None else values - drift[0]
     left, _ = fit_weighted(np.column_stack([rate, zeros]), values, variance)
-    means = np.array(
-        [
-            [left[key == k].mean(), variance[key == k].sum() / (key == k).sum() ** 2 + of_rate[key == k].mean()]
-            for k in np.unique(key)
-        ]
-    )
+    means = _mean_by_rate(left, variance, of_rate, key)
     spread = np.sqrt(means[:, 1])
     worst = int(np.argmax(np.abs(means[:, 0])))
     freedom = len(means) - 2
@@ -529,9 +528,12 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
     loop, fitted_loop, hysteresis = fit_hysteresis(
         left / largest, variance / largest**2, key, runs, direction, rate / largest, error, beyond
     )
-    if loop is not None and not branch.any() and problem.time is not None:
-        steps = rate / largest, values / largest, variance / largest**2
-        loop, fitted_loop = fit_loop(*steps, key, runs, problem.time[on_axis], direction) or (None, None)
+    bend = 1.0
+    if not branch.any() and problem.time is not None:
+        steps, seen = (rate / largest, values / largest, variance / largest**2), (key, runs, problem.time[on_axis])
+        bend = test_bend(*steps, of_rate / largest**2, *seen, order)
+        if loop is not None:
+            loop, fitted_loop = fit_loop(*steps, *seen, direction) or (None, None)
     return Linearity(
         rate=rate,
         residual=left / largest,
@@ -544,6 +546,7 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
         one_rate=test_one_rate(
             rate, problem.table[on_axis], values, variance + of_rate, zeros, int(np.argmax(key == worst))
         ),
+        bend=bend,
         by_noise=reach * float(spread.max()) / largest,
         loop=loop,
         fitted_loop=fitted_loop,
@@ -553,6 +556,12 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
         kink=_fit_kink(rate / largest, values / largest, (variance + of_rate) / largest**2, zeros, len(means)),
         drift=None if drift is None else drift[1:],
     )
+
+
+def _mean_by_rate(left: Array, variance: Array, of_rate: Array, key: NDArray[Any]) -> Array:
+    """Return mean residual of each rate and the variance of that, shape (rates, 2)."""
+    visits = [key == k for k in np.unique(key)]
+    return np.array([[left[v].mean(), variance[v].sum() / v.sum() ** 2 + of_rate[v].mean()] for v in visits])
 
 
 def _fit_drift(
