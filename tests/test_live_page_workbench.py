@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import zipfile
@@ -720,3 +722,16 @@ def test_axe_finds_nothing_in_any_state(workbench, new_page, accessibility, widt
     drop(page, "rec.csv", tumble("own.csv", seed=7))
     page.get_by_text("Made from an older rec.csv").wait_for()
     assert accessibility(page) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kill is another command there")
+def test_a_workbench_without_a_terminal_says_how_to_end_it(folder):
+    found = Workbench()
+    assert "token=" in found.address
+    assert found.process.stderr is not None
+    hint = found.process.stderr.readline()
+    assert hint == f"imulab: note: Ctrl-C ends it, or elsewhere: kill {found.process.pid}\n"
+    os.kill(int(hint.split()[-1]), signal.SIGTERM)
+    assert found.process.wait(30) in (0, 143)
+    out, error = found.process.communicate()
+    assert (out, error) == ("", "")

@@ -5,6 +5,7 @@ A guided test while the unit is connected, in the terminal or on a page; ``imula
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -132,7 +133,7 @@ def on_page(
     part = GuidedPart(runner, made, command, Path(outputs[0] or "record.json").name, place)
     bench, files = workbench(later=[name for name in (runner.recorder.path, *outputs) if name])
     try:
-        serve([part, bench], port, host=checked_host(host), browser=browser)
+        serve([part, bench], port, host=checked_host(host), browser=browser, tell=_tell_address)
     except KeyboardInterrupt:
         if part.record is None:
             raise
@@ -144,6 +145,12 @@ def on_page(
     if part.error is not None:
         with _saying_what_is_kept(runner):
             raise part.error
+
+
+def _tell_address(address: str) -> None:
+    """Print where the page is, and how it is ended, also where no key reaches it."""
+    print(address)
+    note("Ctrl-C ends it" + ("" if os.name == "nt" else f", or elsewhere: kill {os.getpid()}"))
 
 
 # ``imulab open``: the workbench, in the browser of this machine.
@@ -172,7 +179,7 @@ def open(  # noqa: A001 -- the name of the command
     part, session = workbench(files or [])
     session.make()
     try:
-        serve([part], number, host=checked_host(host), browser=not no_browser)
+        serve([part], number, host=checked_host(host), browser=not no_browser, tell=_tell_address)
     finally:
         if session.end():
             note(f"what was dropped and made is in {FOLDER}")
