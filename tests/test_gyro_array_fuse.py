@@ -9,6 +9,7 @@ import pytest
 
 import imulab as il
 from conftest import some_of
+from imulab.cli import main
 from imulab.device import METHODS
 from imulab.device.tables import ArraySettings
 from imulab.device.unit import Blob, Stream, array_stream, make_blob
@@ -483,3 +484,25 @@ def test_a_blob_fuses_as_the_unit_does(imulab, tmp_path):
     refused = imulab("array", "fuse", "run.csv", "--calibration", blob, "--initial-bias", "zero")
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert "a blob holds the biases it starts from: no --initial-bias" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("title", "size", "asked"),
+    [
+        ("s", 1000.0, "10 s from row to row (0.1 Hz): is the unit of time right: 100 Hz if it is in ms?"),
+        ("ms", 1.0, "1e-05 s from row to row (1e+05 Hz): is the unit of time right: 100 Hz if it is in s?"),
+    ],
+)
+def test_times_in_another_unit_than_titled_are_asked_for(tmp_path, capsys, title, size, asked):
+    source = il.simulate_array(elements=4, duration=60.0, rate=100.0, seed=1)
+    path = tmp_path / "a.csv"
+    il.write_csv(source.with_columns({"time": source.time * size}, {}), path)
+    path.write_text(path.read_text().replace("time [s]", f"time [{title}]"))
+    out = str(tmp_path / "out.csv")
+    assert main(["array", "fuse", str(path), "-o", out]) == 0
+    said = capsys.readouterr()
+    assert f"a.csv: column time [{title}]: {asked}" in said.err
+    assert said.out.startswith("look: ")
+    stated = f"time={title}" if title == "s" else "time=s"
+    assert main(["array", "fuse", str(path), "-o", out, "--unit", stated]) == 0
+    assert "is the unit of time right" not in capsys.readouterr().err

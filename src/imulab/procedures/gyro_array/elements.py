@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from imulab.columns import shared_unit
-from imulab.display import Bad, Finding, Note
+from imulab.display import Bad, Finding, Note, prefixed
 from imulab.errors import DataError, RecordError, UnitError
 from imulab.estimation.clock import GAP, read_clock
 from imulab.estimation.rows import resolution
-from imulab.estimation.sampling import mend_stamps, usual_step
+from imulab.estimation.sampling import KILOHERTZ_IN_MS, mend_stamps, mislabelled, usual_step
 from imulab.procedures.gyro_array.schema import array_of
 from imulab.recording import Array, Recording, check_finite, check_time, joined
 from imulab.records.calibration import Calibration
@@ -278,6 +278,8 @@ class SampleClock:
     count: int = 0
     total: float = 0.0
     gaps: list[str] = field(default_factory=list)
+    begin: float = 0.0
+    block: Recording | None = None
 
     def watch(self, block: Recording) -> None:
         """Check that a block's time follows the block before, and note gaps.
@@ -314,7 +316,9 @@ class SampleClock:
                     self.gaps.append(
                         f"a gap of {step[index]:.6g} s before {block.place(row)} at {known[index + 1]:.6g} s"
                     )
-        self.last = float(time[-1])
+        if self.last is None:
+            self.begin = float(time[0])
+        self.last, self.block = float(time[-1]), block
 
     @property
     def rate(self) -> float:
@@ -329,11 +333,15 @@ class SampleClock:
         return self.nominal is not None or len(self.steps) >= _TO_ESTIMATE
 
     def lines(self, name: str) -> list[str]:
-        """Return messages on gaps."""
+        """Return messages on gaps, and the question whether the unit of time is right."""
+        odd: list[str] = []
+        if self.block is not None and self.last is not None and self.steps and self.nominal is None:
+            odd = mislabelled(self.block, self.rate, self.begin, self.last - self.begin, least=KILOHERTZ_IN_MS)
         gaps = list(self.gaps)
         if self.count > len(gaps):
             gaps.append(f"{self.count - len(gaps)} more gaps; {self.total:.6g} s in all {self.count} together")
-        return [Finding(f"{name}: {gap}", "record again without lost samples") for gap in gaps]
+        lost = [Finding(f"{name}: {gap}", "record again without lost samples") for gap in gaps]
+        return [*lost, *(prefixed(name, line) for line in odd)]
 
 
 def find_clocks(recording: Recording) -> dict[int, str]:
