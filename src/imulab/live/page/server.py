@@ -323,25 +323,23 @@ class TextLine:
     """Messages that wait for one page: a slow page gets the latest view, and does not delay the others."""
 
     def __init__(self) -> None:
-        self._waiting: deque[str] = deque(maxlen=_MOST_WAITING)
-        self._latest: dict[str, str] = {}
+        self._waiting: deque[tuple[str, str]] = deque(maxlen=_MOST_WAITING)
         self._some = asyncio.Event()
 
     def put(self, kind: str, text: str, *, latest: bool = False) -> None:
-        """Add a message."""
+        """Add a message, behind all that were told before it; with `latest`, it replaces a waiting one of its kind."""
+        replaces = kind if latest else ""
         if latest:
-            self._latest[kind] = text
-        else:
-            self._waiting.append(text)
+            self._waiting = deque((each for each in self._waiting if each[0] != replaces), _MOST_WAITING)
+        self._waiting.append((replaces, text))
         self._some.set()
 
     async def get(self) -> list[str]:
         """Return the waiting messages, once there are any."""
         await self._some.wait()
         self._some.clear()
-        messages = [*self._waiting, *self._latest.values()]
+        messages = [text for _, text in self._waiting]
         self._waiting.clear()
-        self._latest.clear()
         return messages
 
 
