@@ -260,6 +260,7 @@ def test_finishing_too_early_is_answered_and_the_session_goes_on(live, new_page)
     refusal = page.locator("#said .bad:has-text('attitude')")
     refusal.wait_for()  # a program may ask for it: refused
     page.get_by_role("button", name="Turn it so").click()
+    page.clock.run_for(1)  # the click is over
     page.locator(".sphere .held").nth(1).wait_for(state="attached")
     page.clock.run_for(4900)
     assert refusal.count() == 1  # it stands for 5 s, though another attitude is held at once
@@ -268,7 +269,7 @@ def test_finishing_too_early_is_answered_and_the_session_goes_on(live, new_page)
     running.process.send_signal(signal.SIGINT)
     page.wait_for_selector("#said .bad:has-text('The program has ended')")
     status, error = running.end()
-    assert status == 130
+    assert status == 130, error
     assert "attitudes: --resume goes on with it" in error
 
 
@@ -521,6 +522,17 @@ def test_every_button_is_inside_and_print_has_none(live, new_page):
     shown = "[...document.querySelectorAll('button, a.button, input, select')].filter(each => each.offsetParent).length"
     assert page.evaluate(shown) == 0
     assert "scale_factor_x" in page.inner_text(".result")
+
+
+def test_a_button_stays_while_it_is_pressed(live, new_page):
+    running = live(f"{UNIT},speed=10,knock=3", "--follow", "--attitudes", "40", *FIT, "--save", "rec.csv")
+    page = new_page(running.address)
+    named = page.locator(".said.bad button")
+    named.hover()
+    page.mouse.down()
+    page.wait_for_timeout(2500)  # further attitudes are held meanwhile
+    page.mouse.up()
+    named.wait_for(state="detached")
 
 
 def test_lost_samples_stand_in_the_headline(live, new_page):

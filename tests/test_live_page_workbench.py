@@ -108,7 +108,7 @@ def test_from_the_drop_to_record_report_and_firmware(workbench, new_page, folder
     page.get_by_text("Drop recordings or records here").wait_for()
     drop(page, "unit 7.csv", text)
     page.get_by_text("12 attitudes at rest (shaded)").wait_for()
-    page.locator("svg.plot").first.wait_for()
+    read(page)
     assert page.locator("#workbench").get_attribute("role") == "region"  # one area alone is no tab
     assert page.locator("svg.plot").count() == 4
     assert page.locator("svg.plot >> nth=0 >> rect.attitude").count() == 12
@@ -340,7 +340,7 @@ def test_what_comes_while_the_mouse_is_down_takes_no_click(workbench, new_page):
 def test_what_is_told_of_a_recording_leaves_the_form_and_its_cursor(workbench, new_page):
     held: list[Any] = []
 
-    def pass_on(server: Any, message: str) -> None:
+    def pass_on(message: str) -> None:
         told = json.loads(message)
         if told["type"] == "opening" and "attitudes" in told:
             held.append(message)
@@ -349,8 +349,7 @@ def test_what_is_told_of_a_recording_leaves_the_form_and_its_cursor(workbench, n
 
     def between(route: Any) -> None:
         socket.append(route)
-        server = route.connect_to_server()
-        server.on_message(lambda message: pass_on(server, message))
+        route.connect_to_server().on_message(pass_on)
 
     socket: list[Any] = []
     page = new_page("about:blank")
@@ -533,6 +532,9 @@ def test_a_channel_can_be_read_out_and_hidden_and_a_window_taken(workbench, new_
     plot = page.locator("svg.plot").first
     box = plot.bounding_box()
     page.mouse.move(box["x"] + 0.5 * (box["width"] - 72) + 62, box["y"] + 60)
+    page.set_viewport_size({"width": 1260, "height": 900})  # the plots are drawn anew, and read out where they were
+    narrower = "old => document.querySelector('svg.plot').getAttribute('width') < old - 10"
+    page.wait_for_function(narrower, arg=box["width"])
     shown = page.locator(".plotbox .channel .value").all_inner_texts()
     assert all(shown)  # of every plot, not only of the one under the pointer
     rec = il.read("own.csv")
@@ -540,6 +542,7 @@ def test_a_channel_can_be_read_out_and_hidden_and_a_window_taken(workbench, new_
     near = rec.columns["gyro_x"][middle - 30 : middle + 30]
     value = float(shown[list(rec.units).index("gyro_x") - 1].replace("−", "-"))
     assert near.min() - 1e-3 <= value <= near.max() + 1e-3
+    box = plot.bounding_box()
     page.get_by_role("button", name=re.compile("^accel_y")).click()
     page.locator(".channel[aria-pressed='false']").wait_for()
     assert page.locator("svg.plot").first.locator("path.curve").count() == 2

@@ -1,7 +1,7 @@
 // The guided session: what to do now above all, then where one is, then what is known.
 
 import { bodyPlace, degreesBetween, dragged, drawBody, product, shortest, upright } from "./body.js";
-import { h, inWords, put, show } from "./dom.js";
+import { h, inWords, put, show, unpressed } from "./dom.js";
 import { ResultArea } from "./result.js";
 import { Ring } from "./ring.js";
 import { beep, soundButton, speak, voiceButton } from "./sound.js";
@@ -70,7 +70,8 @@ export function mount(into, given) {
     h("details", {}, h("summary", {}, "What happened"), parts.log));
 }
 
-export function hear(message) {
+export async function hear(message) {
+  if (!drag) await unpressed(); // a body under the hand follows it
   if (message.type === "hello") parts.log.replaceChildren();  // what happened comes again
   if (message.type === "view") view(message);
   else if (message.type === "event") happened(message);

@@ -46,7 +46,7 @@ export function form(definition, { files, values = {}, run, keep = () => {} }) {
   const front = own.filter((each, number) => number < FRONT || values[each.of.name]);
   const behind = own.filter(each => !front.includes(each));
   const part = h("p", { class: "part", hidden: true });
-  const element = h("form", { class: "form", novalidate: true, onsubmit: async event => {
+  const element = h("form", { class: "form", novalidate: true, "data-asked": "", onsubmit: async event => {
     event.preventDefault();
     const values = read(); // what stands there at the click, whatever comes before the answer
     if (await preview(values)) run(values).catch(say);

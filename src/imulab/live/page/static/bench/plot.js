@@ -57,6 +57,7 @@ export function plots(place, act) {
   let drag = null;
   let drawn = [];
   let offset = 0;
+  let pointed = null; // the time that is read out
   let spans = {}; // by plot, the values that it shows where it does not show all
 
   const status = h("p", { class: "range", role: "status" });
@@ -123,6 +124,7 @@ export function plots(place, act) {
     drawn = boxes.map(each => each.svg);
     area.replaceChildren(...boxes.map(each => each.element));
     controls()[focused]?.focus();
+    if (pointed !== null) point(pointed >= low && pointed <= high ? pointed : null);
     area.setAttribute("aria-busy", String(!known.done || rows !== head.rows));
     show(window_, range[0] !== null && head.timed);
     const unit = head.timed ? "s" : "";
@@ -195,6 +197,7 @@ export function plots(place, act) {
 
   // Reads all plots out at a place, and marks it; at none, takes that away.
   function point(place) {
+    pointed = place;
     let k = null;
     if (place !== null && shown.at.length) {
       k = shown.at.findIndex(each => each > place) - 1;
@@ -310,7 +313,7 @@ export function plots(place, act) {
       const other = known?.opening !== message.opening;
       const more = other || known.head?.rows !== message.head?.rows;
       known = message;
-      if (other) { range = act.begin(); spans = {}; shown = null; area.replaceChildren(); put(status, ""); }
+      if (other) { range = act.begin(); spans = {}; shown = pointed = null; area.replaceChildren(); put(status, ""); }
       const some = Boolean(known.head?.rows);
       show(tools, some);
       show(numbers.element, Boolean(some && message.done));
