@@ -116,6 +116,10 @@ class RecordError(ImulabError):
     """A calibration record is damaged, of a newer version, or no record at all."""
 
 
+class LackingError(RecordError):
+    """A calibration record lacks what is asked of it; it may be read for what it has."""
+
+
 class DataError(ImulabError):
     """The samples cannot be what they are said to be: not finite, clipped, dead axis, time running backwards."""
 

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from imulab.arguments import Folder, checked
 from imulab.certificate.dcc import dcc_xml
-from imulab.certificate.laboratory import Laboratory, Language, load_laboratory
+from imulab.certificate.laboratory import Laboratory, LaboratoryError, Language, load_laboratory
 from imulab.certificate.model import (
     SERIAL,
     Certificate,
@@ -164,12 +164,12 @@ def write_fleet_certificates(
             made = _certificate(store.record(unit.serial), stated, limits)
             made = with_days_of_recordings(made)
             _write(made, [Path(output) / f"{unit.serial}{ending}" for ending in (".xml", ".pdf")], lab, fonts, sign)
+        except LaboratoryError:
+            with suppress(OSError):  # it holds files of earlier units
+                if new:
+                    Path(output).rmdir()
+            raise
         except ImulabError as error:
-            if str(error).startswith(f"{lab}: "):  # and so for every unit
-                with suppress(OSError):  # it holds files of earlier units
-                    if new:
-                        Path(output).rmdir()
-                raise
             refused[unit.serial] = str(error)
         if progress is not None:
             progress(count)

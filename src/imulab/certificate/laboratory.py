@@ -18,7 +18,7 @@ from msgspec import Meta, Struct, inspect
 
 from imulab.certificate.units import dsi_unit
 from imulab.display import first_hidden
-from imulab.errors import ReadError, UnitError, first_of, listed, quoted
+from imulab.errors import OptionError, ReadError, UnitError, first_of, listed, quoted
 from imulab.files import load_toml, unit_of
 from imulab.fleet.limits import Rule
 from imulab.quantities import LARGEST
@@ -39,6 +39,10 @@ Size = Annotated[float, _as("a number above 0", gt=0, le=LARGEST)]
 Country = Annotated[str, _as("two capital letters such as DE", pattern="^[A-Z]{2}$")]
 Language = Literal["en", "de"]
 Location = Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"]
+
+
+class LaboratoryError(OptionError):
+    """The laboratory's file cannot be used, whatever the unit."""
 
 
 class _Table(Struct, frozen=True, forbid_unknown_fields=True):

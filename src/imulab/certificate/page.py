@@ -19,7 +19,7 @@ from msgspec import to_builtins
 
 from imulab.certificate.dcc import SCHEMA
 from imulab.certificate.digits import limits_text, printed_unit, rounded, significant, smaller_units, times_power
-from imulab.certificate.laboratory import Party, counted
+from imulab.certificate.laboratory import LaboratoryError, Party, counted
 from imulab.certificate.model import Certificate, Result
 from imulab.certificate.texts import (
     Words,
@@ -74,8 +74,10 @@ def pdf(certificate: Certificate, xml: bytes, lab: str, fonts: str | None = None
     except typst.TypstError as error:
         if missing := _MISSING.search(str(error)):
             raise _no_letter(missing[1], certificate, lab) from None
-        place = f"{lab}: laboratory.logo: " if "decode image" in str(error) else ""
-        raise OptionError(f"{place}the PDF cannot be laid out: {str(error).splitlines()[0]}") from None
+        reason = f"the PDF cannot be laid out: {str(error).splitlines()[0]}"
+        if "decode image" in str(error):  # Typst says no other way that it is the logo
+            raise LaboratoryError(f"{lab}: laboratory.logo: {reason}") from None
+        raise OptionError(reason) from None
     return made
 
 
@@ -94,12 +96,13 @@ def _no_letter(letters: str, certificate: Certificate, lab: str) -> OptionError:
     """Say which letter no font has, and where it stands."""
     texts = _texts(to_builtins(certificate.lab), "")
     serial = certificate.serial  # which the number may hold
-    places = (f"{lab}: {counted(place)}" for place, text in texts if letters in text.replace(serial, ""))
+    place = next((counted(place) for place, text in texts if letters in text.replace(serial, "")), "")
     codes = " ".join(f"U+{ord(letter):04X}" for letter in letters)
-    return OptionError(
-        f"{next(places, 'the record')}: no font of the PDF has the letter {letters!r} ({codes}); expected --fonts DIR "
-        "with a font that has it, or another spelling (the XML takes every letter)"
+    reason = (
+        f"no font of the PDF has the letter {letters!r} ({codes}); expected --fonts DIR with a font that has it, or "
+        "another spelling (the XML takes every letter)"
     )
+    return LaboratoryError(f"{lab}: {place}: {reason}") if place else OptionError(f"the record: {reason}")
 
 
 def _texts(value: Any, place: str) -> Iterator[tuple[str, str]]:

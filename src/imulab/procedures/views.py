@@ -16,7 +16,7 @@ import numpy as np
 
 from imulab import report
 from imulab.display import LINES, SENTENCES, WIDTH, aligned, html_table
-from imulab.errors import OptionError, RecordError, listed
+from imulab.errors import LackingError, OptionError, RecordError, listed
 from imulab.estimation.distributions import probability_text
 from imulab.files import write_page
 from imulab.frames import foreign_of, frame_library, is_frame, name_of
@@ -56,11 +56,12 @@ def exhibits_of(record: Calibration) -> Exhibits:
     """
     try:
         exhibits = procedure_of(record).exhibits(record)
-    except RecordError as error:
-        if not str(error).startswith("the record lacks ") or not record.parameters:
+    except LackingError as error:
+        if not record.parameters:
             raise
         table = parameters_table(parameter_rows(record), "u is the standard uncertainty, – where none is stated.")
-        headline = f"T{str(error)[1:]}: its parameters alone are shown; fit again for all figures."
+        lacking = str(error)
+        headline = f"{lacking[:1].upper()}{lacking[1:]}: its parameters alone are shown; fit again for all figures."
         return Exhibits(headline, [], [table])
     for procedure in joined_of(record):
         more = procedure.joined(record)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from imulab._version import VERSION
 from imulab.arguments import checked
 from imulab.display import UNJUDGED, Finding, Verdict, first_hidden, has_hidden, may_hide, printable, verdict_of
-from imulab.errors import OptionError, RecordError
+from imulab.errors import LackingError, OptionError, RecordError
 from imulab.files import write_text
 from imulab.frames import data_frame
 from imulab.recording import Recording, Source
@@ -212,7 +212,7 @@ class Covariance:
         """
         for name in names:
             if name not in self.names:
-                raise RecordError(f"the record lacks the covariance of {name}")
+                raise LackingError(f"the record lacks the covariance of {name}")
         index = [self.names.index(name) for name in names]
         return self.array()[np.ix_(index, index)]
 
@@ -283,7 +283,7 @@ class Calibration:
             The record lacks it.
         """
         if name not in self.parameters:
-            raise RecordError(f"the record lacks {name}")
+            raise LackingError(f"the record lacks {name}")
         return self.parameters[name]
 
     def to_dict(self) -> dict[str, Any]:

@@ -32,7 +32,7 @@ import msgspec
 from msgspec import NODEFAULT
 from msgspec import field as field
 
-from imulab.errors import RecordError, quoted
+from imulab.errors import LackingError, RecordError, quoted
 from imulab.quantities import LARGEST, SMALLEST
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Part(msgspec.Struct, metaclass=_PartMeta, frozen=True, dict=True):
         def __getattr__(self, name: str) -> Any:
             if name not in self.__struct_fields__:
                 raise AttributeError(f"{type(self).__name__} has no field {name}")
-            raise RecordError(f"the record lacks {_text((self.__dict__['place'], name.rstrip('_')))}")
+            raise LackingError(f"the record lacks {_text((self.__dict__['place'], name.rstrip('_')))}")
 
 
 def null() -> Any:
@@ -146,7 +146,7 @@ class Named(dict[str, Any]):
         self.place = place
 
     def __missing__(self, key: str) -> Any:
-        raise RecordError(f"the record lacks {_text((self.place, key))}")
+        raise LackingError(f"the record lacks {_text((self.place, key))}")
 
 
 class Quantity(Part):
@@ -235,7 +235,7 @@ def part(record: Calibration, kind: type[P], place: str = "") -> P:
     value: Any = {"model": record.model, "fit": record.fit, "data": record.data, **record.sections}
     for key in place.split(".") if place else ():
         if not isinstance(value, Mapping) or key not in value:
-            raise RecordError(f"the record lacks {place}")
+            raise LackingError(f"the record lacks {place}")
         value = value[key]
     return read(kind, value, place)
 
@@ -411,7 +411,7 @@ def _dataclass_reader(kind: Any) -> _Reader:
             if name in value:
                 held[name] = read_item(value[name], (where, name), counts)
             elif required:
-                raise RecordError(f"the record lacks {_text((where, name))}")
+                raise LackingError(f"the record lacks {_text((where, name))}")
         return kind(**held)
 
     return read_dataclass

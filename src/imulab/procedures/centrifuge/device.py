@@ -9,7 +9,7 @@ import numpy as np
 
 from imulab.device.tables import DeviceTable, Field, field_of
 from imulab.device.unit import VECTORS, DeviceUnit
-from imulab.errors import RecordError, UnitError
+from imulab.errors import LackingError, RecordError, UnitError
 from imulab.procedures.centrifuge.schema import highest_force
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration
@@ -31,7 +31,7 @@ def tables_of(record: Calibration) -> tuple[DeviceTable, ...]:
     """
     axes = [axis for axis in "xy" if f"{axis}_K0" in record.parameters]
     if not axes:
-        raise RecordError("the record lacks x_K0")
+        raise LackingError("the record lacks x_K0")
     for name, parameter in record.parameters.items():
         expected = _CURVE_UNITS.get(name.rpartition("_")[2])
         if expected is not None and parameter.unit != expected:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import RecordError
+from imulab.errors import LackingError, RecordError
 from imulab.estimation.least_squares import coverage_factor
 from imulab.procedures.centrifuge.manifest import curve
 from imulab.procedures.centrifuge.schema import (
@@ -377,7 +377,7 @@ def exhibits(record: Calibration) -> Exhibits:
     """Return what a report on this record shows."""
     sets, r = prefixes(record), centrifuge_of(record)
     if not sets or not all(numbers(record, prefix) for prefix in sets):
-        raise RecordError("the record lacks x_K0, or the K of any level")
+        raise LackingError("the record lacks x_K0, or the K of any level")
     items: list[Figure | ReportTable] = [_zeta(record, sets)]
     if any(f"{p}direction" in record.parameters for p in sets):
         items.append(_polar(record, [p for p in sets if f"{p}direction" in record.parameters]))
@@ -488,7 +488,7 @@ def _polar(record: Calibration, sets: list[str]) -> Figure:
         key = prefix[0] if "down" not in prefix else f"{prefix[0]}_down"
         rows = [(row, line) for row in centrifuge_of(record).levels if (line := row.line(key)) is not None]
         if not rows:
-            raise RecordError(f"the record lacks levels with {key}")
+            raise LackingError(f"the record lacks levels with {key}")
         z = np.array([complex(line.A, line.B) for _, line in rows]) * PER_G
         force = [from_si(row.specific_force.value, "g") for row, _ in rows]
         angle = np.linspace(0, 2 * np.pi, 49)
@@ -605,7 +605,7 @@ def _spectra(r: CentrifugeRecord) -> list[Figure]:
         key = "x" if spectrum.spin_axis == "up" else "x_down"
         drift, a = row.line(key), row.specific_force.value
         if drift is None:
-            raise RecordError(f"level {row.level} lacks {key}")
+            raise LackingError(f"level {row.level} lacks {key}")
         K = abs(complex(drift.A, drift.B))
         line = from_si(K * a, "deg/h")
         centre = float(np.median(rate))

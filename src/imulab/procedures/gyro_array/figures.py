@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import RecordError
+from imulab.errors import LackingError, RecordError
 from imulab.procedures.gyro_array.alignment import SLOWER_NOISE, TRUTH
 from imulab.procedures.gyro_array.elements import JUMPED, NON_FINITE, STUCK, unit_of_angle
 from imulab.procedures.gyro_array.imus.figures import exhibits as imus_exhibits
@@ -404,7 +404,7 @@ def _matrix_table(record: ArrayRecord) -> ReportTable:
     rows = []
     for element in record.elements:
         if element.matrix is None or element.residual is None:
-            raise RecordError(f"the record lacks the matrix or residual of element {element.name}")
+            raise LackingError(f"the record lacks the matrix or residual of element {element.name}")
         cells = ["  ".join(f"{value:+.4f}" for value in row) for row in element.matrix.value]
         worst = 1e6 * np.max(element.matrix.standard_uncertainty)
         rows.append([element.name, *cells, f"{worst:.0f}", plain_number(_deg(element.residual.values.max()), 3)])

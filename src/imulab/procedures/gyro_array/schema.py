@@ -6,7 +6,7 @@ from typing import Annotated, TypeVar
 
 import numpy as np
 
-from imulab.errors import RecordError
+from imulab.errors import LackingError, RecordError
 from imulab.recording import Array
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Above0, Length, Part, Positive, Quantity, holds, part
@@ -85,7 +85,7 @@ class Element(Part):
         if self.matrix is not None:
             return np.array(self.matrix.value)
         if self.scale_factor is None or not self.scale_factor.value:
-            raise RecordError(f"the record lacks the matrix or scale factor of element {self.name}")
+            raise LackingError(f"the record lacks the matrix or scale factor of element {self.name}")
         return np.array([[1 / self.scale_factor.value]])
 
 

@@ -10,7 +10,7 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from imulab.errors import OptionError, RecordError, UnitError, quoted
+from imulab.errors import LackingError, OptionError, RecordError, UnitError, quoted
 from imulab.estimation.noise.terms import NAMES, SIGMA, TIME, is_model
 from imulab.quantities import in_si, split_quantity
 from imulab.recording import Array
@@ -206,7 +206,7 @@ def drawn_of(record: Calibration, column: str) -> ColumnFigures:
     columns = record.data.get("columns")
     held = columns.get(column) if isinstance(columns, Mapping) else None
     if not isinstance(held, Mapping) or not isinstance(held.get("spectra"), Sequence) or not held["spectra"]:
-        raise RecordError(f"the record lacks {where}.spectra")
+        raise LackingError(f"the record lacks {where}.spectra")
     spectra = [read_section(BinnedSpectrum, each, f"{where}.spectra[{k}]") for k, each in enumerate(held["spectra"])]
     for k, each in enumerate(spectra):
         edges = list(zip(each.first, each.last, strict=True))

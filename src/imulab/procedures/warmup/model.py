@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.errors import RecordError, UnitError
+from imulab.errors import LackingError, RecordError, UnitError
 from imulab.procedures.warmup import BEYOND, EXITS, MODELS
 from imulab.procedures.warmup.cycles import Curves, Index
 from imulab.recording import Array
@@ -292,7 +292,7 @@ def record_table(record: Calibration) -> WarmupTable:
         The record has none, or one that cannot be evaluated.
     """
     if "table" not in record.sections:
-        raise RecordError("the warm-up record lacks its table")
+        raise LackingError("the warm-up record lacks its table")
     return table_from(record.sections["table"])
 
 

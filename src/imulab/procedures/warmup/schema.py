@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, TypeVar
 
-from imulab.errors import RecordError
+from imulab.errors import LackingError, RecordError
 from imulab.records.calibration import Calibration
 from imulab.records.sections import Above0, Part, Positive, Quantity, Size, field, part
 
@@ -75,7 +75,7 @@ class WarmupSummary(Part):
         for row in self.models:
             if row.chosen if model is None else row.model == model:
                 return row
-        raise RecordError(f"fit.models lacks {'the chosen model' if model is None else f'model {model}'}")
+        raise LackingError(f"fit.models lacks {'the chosen model' if model is None else f'model {model}'}")
 
 
 class HeldTable(Part):
