@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 import madeup
+from benchpage import Workbench
 from imulab.cli import main
 from imulab.exporters import export
 from imulab.recording import Array, Recording
@@ -208,6 +209,15 @@ def new_page(browser: Any) -> Iterator[Callable[[str], Any]]:
     yield opened
     context.close()
     assert not faults
+
+
+@pytest.fixture
+def workbench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Workbench]:
+    """The workbench in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    running = Workbench()
+    yield running
+    running.close()
 
 
 @pytest.fixture

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,50 +18,16 @@ import pytest
 pytest.importorskip("starlette", reason="the page needs the extra live")
 
 import imulab as il
+from benchpage import Workbench, command, drop, read, run, tumble
 from imulab.cli import main
 
 EVIL = "<img src=x onerror=document.title='taken'>"
-DROP = """([name, text]) => {
-  const data = new DataTransfer();
-  data.items.add(new File([text], name));
-  for (const kind of ["dragover", "drop"])
-    document.body.dispatchEvent(new DragEvent(kind, { dataTransfer: data, bubbles: true, cancelable: true }));
-}"""
-
-
-class Workbench:
-    """`imulab open` in a process of its own, in the working folder."""
-
-    def __init__(self, *files: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "imulab", "open", *files, "--no-browser"],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert self.process.stdout is not None
-        self.address = self.process.stdout.readline().strip()
-
-    def close(self) -> None:
-        self.process.terminate()
-        self.process.communicate(timeout=30)
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def workbench(folder) -> Iterator[Workbench]:
-    found = Workbench()
-    yield found
-    found.close()
-
-
-def tumble(name: str, **more: Any) -> str:
-    """Write a recording, and return its text."""
-    il.write_csv(il.simulate_tumble(attitudes=12, hold="3 s", gravity=9.81, **more), name)
-    return Path(name).read_text()
 
 
 def saved(page: Any, name: str) -> Path:
@@ -78,28 +41,6 @@ def unsealed(path: Path) -> list[bytes]:
     lines = path.read_bytes().splitlines()
     assert len(lines) > 100
     return [line for line in lines if b'"created"' not in line and b'"content_sha256"' not in line]
-
-
-def drop(page: Any, name: str, text: str) -> None:
-    """Drop a file on the page, as a mouse does."""
-    page.locator(".drop").wait_for()
-    page.evaluate(DROP, [name, text])
-
-
-def read(page: Any) -> None:
-    """Wait until a recording of attitudes is read to its end, and its plots are of all its rows."""
-    page.get_by_text("attitudes at rest").wait_for()
-    page.locator(".plots[aria-busy='false'] svg.plot").first.wait_for()
-
-
-def command(page: Any) -> str:
-    """Return the command line of the form, once it is that of the form's values."""
-    page.locator(".form:not([data-asked])").wait_for()
-    return page.locator(".form .command code").inner_text()
-
-
-def run(page: Any) -> None:
-    page.get_by_role("button", name="Run", exact=True).click()
 
 
 def test_from_the_drop_to_record_report_and_firmware(workbench, new_page, folder):
@@ -296,74 +237,6 @@ def test_a_file_that_comes_late_does_not_hide_the_one_that_was_clicked_on(workbe
     page.locator("[data-name='imulab-files/two.csv']").wait_for()
     page.wait_for_timeout(300)
     assert page.get_by_role("heading", name="one.csv").count() == 1
-
-
-def arrive(page: Any, name: str) -> None:
-    """Let a file reach the session from elsewhere, so that a message tells every page of it."""
-    put = "name => fetch('/api/workbench/files/' + name, { method: 'PUT', body: 't;a' }).then(answer => answer.ok)"
-    assert page.evaluate(put, name)
-
-
-def test_a_click_on_run_runs_what_stands_there_whatever_comes_before_the_answer(workbench, new_page):
-    page = new_page(workbench.address)
-    drop(page, "rec.csv", tumble("own.csv"))
-    read(page)
-    page.get_by_label("order", exact=True).fill("1")
-    command(page)
-    held: list[Any] = []
-    page.route("**/api/workbench/command", lambda route: held.append(route), times=1)
-    run(page)
-    while not held:
-        page.wait_for_timeout(20)
-    arrive(page, "late.csv")
-    page.locator("[data-name='imulab-files/late.csv']").wait_for()  # and the form asks again
-    command(page)
-    held[0].continue_()
-    page.locator(".job .found").wait_for()
-    assert "--order 1" in page.locator(".job .command code").text_content()
-
-
-def test_what_comes_while_the_mouse_is_down_takes_no_click(workbench, new_page):
-    page = new_page(workbench.address)
-    drop(page, "one.csv", "t;a\n1;x\n")
-    drop(page, "rec.csv", tumble("own.csv"))
-    read(page)
-    page.locator("[data-name='imulab-files/one.csv']").hover()
-    page.mouse.down()
-    arrive(page, "a.csv")  # above it in the list
-    page.wait_for_timeout(300)
-    page.mouse.up()
-    page.get_by_role("heading", name="one.csv").wait_for()
-    page.locator("[data-name='imulab-files/a.csv']").wait_for()
-
-
-def test_what_is_told_of_a_recording_leaves_the_form_and_its_cursor(workbench, new_page):
-    held: list[Any] = []
-
-    def pass_on(message: str) -> None:
-        told = json.loads(message)
-        if told["type"] == "opening" and "attitudes" in told:
-            held.append(message)
-        else:
-            socket[0].send(message)
-
-    def between(route: Any) -> None:
-        socket.append(route)
-        route.connect_to_server().on_message(pass_on)
-
-    socket: list[Any] = []
-    page = new_page("about:blank")
-    page.route_web_socket("**/ws", between)
-    page.goto(workbench.address)
-    drop(page, "rec.csv", tumble("own.csv"))
-    gravity = page.get_by_label("gravity", exact=True)
-    gravity.press_sequentially("9.")
-    while not held:
-        page.wait_for_timeout(20)
-    socket[0].send(held[-1])
-    page.get_by_text("attitudes at rest").wait_for()
-    page.keyboard.type("81")
-    assert gravity.input_value() == "9.81"
 
 
 def test_nothing_of_a_files_text_is_executed(workbench, new_page, folder):

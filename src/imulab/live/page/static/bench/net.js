@@ -32,9 +32,10 @@ export function send(file, tell) {
     request.open("PUT", address("files", file.name));
     request.upload.onprogress = event => tell(event.lengthComputable ? event.loaded / event.total : 0);
     request.onerror = () => failed(new Error(`${file.name}: was not received; is it larger than 4 GiB?`));
-    request.onload = () => {
+    request.onload = async () => {
       let answer = {};
       try { answer = JSON.parse(request.responseText); } catch { answer = { error: request.responseText }; }
+      await unpressed();
       if (request.status === 200) done(answer);
       else failed(new Error(answer.error || `${file.name}: was not received`));
     };
