@@ -84,21 +84,19 @@ def at_rest(still: Recording, rate: float, elements: Elements, record: Calibrati
     return AtRest(np.reshape(bias, spread.shape), curves, noise, white, spread, duration, rate), notes
 
 
-SLOWER_NOISE = "slower noise, which so short a stretch cannot show"
-"""In the note of `unseen`."""
+def slower_noise(noises: Mapping[str, ColumnNoise], rest: AtRest) -> float:
+    """Return how many times as large noise too slow to show could make the uncertainties of the biases; 1: none."""
+    return max((each.unseen(rest.duration) for each in noises.values()), default=1.0)
 
 
-def unseen(noises: Mapping[str, ColumnNoise], rest: AtRest) -> list[str]:
-    """Return a note by how much noise too slow to show could enlarge the uncertainties of the biases."""
-    most = max((each.unseen(rest.duration) for each in noises.values()), default=1.0)
-    if most == 1:
-        return []
-    largest = math.degrees(float(rest.uncertainty.max())) * 3600
-    return [
-        f"the uncertainties of the biases, up to {largest:.3g} deg/h, hold the noise that {rest.duration:.4g} s show; "
-        f"{SLOWER_NOISE}, could make them up to {most:.2g} times as large "
-        "(--noise RECORD: the noise of a longer log)"
-    ]
+def slower_noise_text(times: float, uncertainties: Array, duration: float) -> str:
+    """Say so of uncertainties of biases, rad/s, by a test of a duration, s."""
+    largest = math.degrees(float(np.nanmax(uncertainties))) * 3600
+    return (
+        f"the uncertainties of the biases, up to {largest:.3g} deg/h, hold "
+        f"the noise that {duration:.4g} s show; slower noise, which so short a stretch cannot show, could make them up "
+        f"to {times:.2g} times as large (--noise RECORD: the noise of a longer log)"
+    )
 
 
 # In motion: alignment of the elements against their consensus.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from imulab.errors import LackingError, RecordError
-from imulab.procedures.gyro_array.alignment import SLOWER_NOISE, TRUTH
+from imulab.procedures.gyro_array.alignment import TRUTH, slower_noise_text
 from imulab.procedures.gyro_array.elements import JUMPED, NON_FINITE, STUCK, unit_of_angle
 from imulab.procedures.gyro_array.imus.figures import exhibits as imus_exhibits
 from imulab.procedures.gyro_array.imus.schema import imus_of
@@ -320,8 +320,12 @@ def reservations(record: Calibration) -> list[str]:
         "measured: uncertainties do not hold its error."
     )
     gauge = record.model.get("gauge")
-    slower_noise = [warning for warning in record.warnings if SLOWER_NOISE in warning]
-    return [earth, *[relative] * (gauge not in (None, TRUTH)), *slower_noise]
+    reserved = [earth, *[relative] * (gauge not in (None, TRUTH))]
+    if record.model.get("kind") == "calibration" and (slower := array_of(record).fit.slower_noise):
+        uncertainties = np.array([element.bias.uncertainties for element in array_of(record).elements])
+        text = slower_noise_text(slower, uncertainties, array_of(record).fit.duration.value)
+        reserved.append(f"{text[0].upper()}{text[1:]}.")
+    return reserved
 
 
 def _calibration(record: ArrayRecord) -> Exhibits:

@@ -26,7 +26,8 @@ from imulab.procedures.gyro_array.alignment import (
     at_rest,
     bend_notes,
     latency_notes,
-    unseen,
+    slower_noise,
+    slower_noise_text,
 )
 from imulab.procedures.gyro_array.elements import (
     ROWS_AT_ONCE,
@@ -140,11 +141,14 @@ def calibrate_array(
     noises = {elements.names[a][i]: gyro_noise for a, row in enumerate(rest.noise) for i, gyro_noise in enumerate(row)}
     warnings += [prefixed(still.name, line) for line in noise_lines(noises)]
     warnings += [prefixed(still.name, line) for line in _warn_steps(still, elements, rest)]
-    if noise is None:
-        warnings += [Note(f"{still.name}: {line}") for line in unseen(noises, rest)]
+    slower = slower_noise(noises, rest) if noise is None else 1.0
+    if slower > 1:
+        warnings.append(Note(f"{still.name}: {slower_noise_text(slower, rest.uncertainty, rest.duration)}"))
     if fusion is not None and fusion.method == "feedback":
         warnings += [prefixed(still.name, line) for line in feedback_notes(elements.count, rest.rate)]
     record = _make_record(still, moving, elements, rest, aligned, covariance, used, count, warnings)
+    if slower > 1:
+        record = replace(record, fit={**record.fit, "slower_noise": slower})
     if fusion is not None:
         record = replace(record, model={**record.model, "fusion": fusion.to_dict()})
     if serial is not None:

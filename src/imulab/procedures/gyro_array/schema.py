@@ -34,10 +34,11 @@ class ArrayModel(Part):
 
 
 class ArraySummary(Part):
-    """``fit``."""
+    """``fit``; `slower_noise` is by what factor noise too slow to show could enlarge the biases' uncertainties."""
 
     sample_rate: Above0
     duration: Above0
+    slower_noise: Positive | None = None
 
 
 class PerGyro(Part):
