@@ -1,5 +1,6 @@
 """The report: complete, self-contained, safe, and drawn by a real browser without a network."""
 
+import itertools
 import re
 import subprocess
 from dataclasses import replace
@@ -11,7 +12,7 @@ import pytest
 import imulab as il
 from conftest import REPOSITORY, table
 from imulab.errors import RecordError
-from imulab.procedures.views import exhibits_of
+from imulab.procedures.views import exhibits_of, render_record
 from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.report import render_page
 from imulab.report.traces import Exhibits, Figure, ReportTable, correlation_map, format_uncertain, log_axis, narrow
@@ -323,3 +324,19 @@ def test_a_print_hides_buttons_and_is_a4(record, chromium, tmp_path):
     boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf)
     assert {(round(float(w)), round(float(h))) for w, h in boxes} == {(595, 842)}
     assert 3 <= len(boxes) <= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [390, 768, 1280])
+def test_no_cell_of_a_table_of_parameters_lies_over_another(record, browser, tmp_path, width):
+    (tmp_path / "r.html").write_text(render_record(record), encoding="utf-8")
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    page.goto((tmp_path / "r.html").as_uri())
+    cells = page.evaluate(
+        """() => [...document.querySelector('table').tBodies[0].rows].map(row =>
+        [...row.cells].map(cell => cell.getBoundingClientRect()).map(box => [box.left, box.right]))"""
+    )
+    page.close()
+    for row in cells:
+        assert all(left >= before - 1 for (_, before), (left, _) in itertools.pairwise(row))
+        assert row[-1][1] <= width
