@@ -438,7 +438,7 @@ def test_a_link_that_is_lost_keeps_the_page_and_comes_back(live, new_page, tmp_p
 
 def test_a_session_that_ends_without_a_record_keeps_its_tables(live, new_page, tmp_path):
     il.write_csv(il.simulate_tumble(attitudes=5, order=1, gravity=9.81, gyro=False), tmp_path / "few.csv")
-    running = live("replay:few.csv@20", *FIT, "--save", "rec.csv", "-o", "rec.json")
+    running = live("replay:few.csv@6", *FIT, "--save", "rec.csv", "-o", "rec.json")
     page = new_page(running.address)
     page.wait_for_selector("#said .bad:has-text('For a record it needs at least 4 more attitudes.')")
     assert page.inner_text(".advice") == "The session has ended without a record."
