@@ -36,7 +36,7 @@ from imulab.writers import powers_of_five
 # Lines of a file: one by one for the head, in whole blocks below.
 
 
-_BLOCK_BYTES = 1 << 21  # read at once
+_BLOCK_BYTES, _LONG = 1 << 21, 1 << 25  # read at once; bytes beyond which it is twice as much, for fewer blocks
 WORTH_SHARING = 1 << 19  # bytes from which a block is shared among threads
 _MOST_THREADS = 8  # that parse one file
 LONGEST_LINE = 1 << 20  # bytes: a longer line without an end is no text
@@ -250,7 +250,7 @@ class Lines:
     def _next_bytes(self) -> bytes:
         while True:
             try:
-                data = self._read(_BLOCK_BYTES)
+                data = self._read(_BLOCK_BYTES << (self.taken > _LONG))
             except OSError as error:
                 raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
             self._ended = not data
