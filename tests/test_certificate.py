@@ -694,6 +694,8 @@ def test_limits_that_cannot_be_decided_by_are_refused(issue, capsys, rule, limit
 
 
 def test_the_template_is_that_of_the_guide_and_makes_a_valid_certificate(issue, schemas, capsys):
+    assert main(["certificate", "--template", "-o", "t.pdf"]) == 2
+    assert capsys.readouterr().err == "imulab: t.pdf: the template is TOML; expected a name that ends in .toml\n"
     assert main(["certificate", "--template"]) == 0
     template = capsys.readouterr().out
     guide = Path(__file__).resolve().parents[1] / "docs" / "certificate.md"

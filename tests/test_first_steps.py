@@ -283,7 +283,14 @@ def test_a_recording_before_its_record_is_named(imulab, tmp_path, recording):
     assert done.returncode == 2
     assert done.stderr == "imulab: t.json: expected a recording as the last file, found a record: records go first\n"
     done = imulab("report", "t.csv", "-o", "r.html")
-    assert done.stderr == "imulab: t.csv: not a calibration record: it is not JSON (a recording?)\n"
+    assert done.stderr == (
+        "imulab: t.csv: not a calibration record: it is not JSON (a recording?); expected the .json that a fit writes\n"
+    )
+    (tmp_path / "e.json").write_text("")
+    done = imulab("report", "e.json", "-o", "r.html")
+    assert (
+        done.stderr == "imulab: e.json: not a calibration record: it is empty; expected the .json that a fit writes\n"
+    )
 
 
 def test_what_is_printed_of_a_recording_is_a_line(recording):

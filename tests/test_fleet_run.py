@@ -626,4 +626,4 @@ def test_a_file_called_like_a_layout_that_comes_along_is_the_file(imulab, tmp_pa
         "Time (s),Acceleration x (m/s^2),Acceleration y (m/s^2),Acceleration z (m/s^2)\n0,1,2,3\n"
     )
     done = imulab("fleet", "run", "in/manifest.csv", "-o", "named", "--workers", 1)
-    assert "u0.csv: 1 sample over 0 s are too few to find static attitudes" in done.stderr  # its columns were known
+    assert "u0.csv: 1 sample over 0 s is too few to find static attitudes" in done.stderr  # its columns were known

@@ -144,7 +144,7 @@ LINES = {
     "no rows": (lambda g: (g["frame"].iloc[:0], {}), "frame: no samples"),
     "no rows of polars": (lambda g: (g["polars"].head(0), {}), "frame: no samples"),
     "no rows of an array": (lambda g: (g["a"][:0], {"unit": "g"}), "arrays: no samples"),
-    "one row": (lambda g: (g["frame"].iloc[:1], {}), "frame: 1 sample over 0 s are too few"),
+    "one row": (lambda g: (g["frame"].iloc[:1], {}), "frame: 1 sample over 0 s is too few"),
     "masked": (lambda g: (g["masked"], READ), "row 101, column accel_x: expected a finite number, found nan (and 9"),
     "transposed": (lambda g: (g["a"].T, READ), "expected an array of shape (n, 3), found (3, 4600) (transposed?)"),
     "two axes": (lambda g: (g["a"][:, :2], READ), "expected an array of shape (n, 3), found (4600, 2)"),

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import warnings
 from html import unescape
 
 import allantools
@@ -12,6 +13,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 import imulab as il
+from imulab.cli import main
 from imulab.errors import DataError, OptionError
 from imulab.estimation import _allan
 from imulab.estimation.column_noise import analyse, columns_noise, noise_lines
@@ -370,6 +372,14 @@ def test_the_check_report_says_pass_or_fail_first(imulab, tmp_path, gravity, ver
     for _, residual, u, ratio in rows:
         (a, unit_a), (b, unit_b) = residual.split(), u.split()
         assert float(a) * size[unit_a] / (float(b) * size[unit_b]) == pytest.approx(float(ratio), abs=0.06, rel=0.02)
+
+
+def test_a_single_row_is_refused_without_a_warning_of_numpy(tmp_path, capsys):
+    (tmp_path / "one.csv").write_text("time [s],gyro_x [deg/s]\n0,1\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main(["allan", str(tmp_path / "one.csv")]) == 2
+    assert capsys.readouterr().err.endswith("one.csv: 1 sample is too few; expected at least 3\n")
 
 
 @pytest.mark.parametrize("command", [("allan", "x.csv"), ("tumble", "check", "r.json", "x.csv")])

@@ -304,7 +304,7 @@ def test_a_record_that_was_cut_is_refused():
     whole = TEXT.rstrip()
     for length in range(len(whole)):
         with pytest.raises(
-            RecordError, match=r"^sn42\.json: not a calibration record: it is (cut or altered|not JSON)"
+            RecordError, match=r"^sn42\.json: not a calibration record: it is (cut or altered|not JSON|empty)"
         ):
             loads(whole[:length], "sn42.json")
     with pytest.raises(RecordError, match="it is cut or altered"):
@@ -314,7 +314,7 @@ def test_a_record_that_was_cut_is_refused():
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "it is not JSON"),
+        (b"", "it is empty"),
         (b"time [s],accel_x [g]\n0,1\n", "it is not JSON"),
         (b"\x89PNG\r\n\x1a\n\0\0", "it is not JSON"),
         (b"[" * 100_000, "it is not JSON"),

@@ -150,11 +150,12 @@ _IMPERATIVE = re.compile(
 
 _THINGS = "(attitude|spike|sample|row|turn|hold|soak|log|cycle|column|line|field|run|gyro|dwell|stop)"
 _ONE = re.compile(rf"(?<![\w.,:/-])1 {_THINGS}s\b")
+_ONE_IS = re.compile(rf"((?<![\w.,:/-])1 {_THINGS}(?: over \S+ s| at rest)?) are(?= too few)")
 
 
 def one_thing(text: str) -> str:
     """Return a text with ``1 attitude`` in place of ``1 attitudes``."""
-    return _ONE.sub(r"1 \1", text) if "1 " in text else text
+    return _ONE_IS.sub(r"\1 is", _ONE.sub(r"1 \1", text)) if "1 " in text else text
 
 
 class Finding(str):

@@ -51,6 +51,8 @@ def certificate(
         if output is None:
             print(TEMPLATE, end="")
             return
+        if not output.lower().endswith(".toml"):
+            raise OptionError(f"{output}: the template is TOML; expected a name that ends in .toml")
         check_outputs([output], [])
         with replacing(output) as stream:
             stream.write(TEMPLATE.encode())

@@ -89,7 +89,9 @@ def _content(data: bytes, name: str) -> Any:
             ) from None
         reason = "it is cut or altered" if FORMAT.encode() in data[:2000] else "it is not JSON"
         if not data.lstrip().startswith(b"{"):
-            what = "not JSON (a recording?)"
+            what = "not JSON (a recording?); expected the .json that a fit writes"
+            if not data.strip():
+                what = "empty; expected the .json that a fit writes"
             if data.startswith(b"%PDF-"):
                 what = "a PDF (a certificate?); expected the record that it was made of"
             elif b"digitalCalibrationCertificate" in data[:4096]:

@@ -278,6 +278,8 @@ def _repeated(columns: Sequence[Array], kinds: Sequence[str]) -> float:
     largest = 0.0
     for kind in dict.fromkeys(kinds):
         same = [values[1:] == values[:-1] for values, its in zip(columns, kinds, strict=True) if its == kind]
+        if not same[0].size:  # a single row
+            continue
         share = float(np.mean(np.logical_and.reduce(same)))
         chance = float(np.prod([each.mean() for each in same]))
         if len(same) == 1:
