@@ -14,6 +14,7 @@ from imulab.estimation.rows import (
     count_changes,
     distinct,
     find_step,
+    frozen_runs,
     leave_out,
     long_runs,
     median,
@@ -113,6 +114,46 @@ def test_a_log_that_is_faster_than_its_sensor_is_left_alone():
     recording = counts(count=10000)
     twice = of(np.repeat(recording.triad("accel"), 2, axis=0))
     assert leave_out(twice, names("accel")).notes() == []
+
+
+def frozen(recording, first, behind):
+    """The recording with all readings of some rows as in the first of them."""
+    columns = {name: np.array(values) for name, values in recording.columns.items()}
+    for name in columns.keys() - {"time"}:
+        columns[name][first:behind] = columns[name][first]
+    return Recording(columns, recording.units, name=recording.name)
+
+
+@pytest.mark.parametrize("seconds", [20, 31, 60])
+def test_a_link_that_stands_still_from_attitude_to_attitude_is_no_attitude(seconds):
+    """31 s of one reading counted as an attitude of their own, verdict good."""
+    clean = held(5)
+    start = int(np.searchsorted(clean.time, 42.0))
+    bad = frozen(clean, start, start + int(np.searchsorted(clean.time, seconds)))
+    record = fitted(bad)
+    assert record.verdict.state == "look"
+    assert any("left out: exact repeats of the row before" in warning for warning in record.warnings)
+    error, u = errors(record)
+    assert np.abs(error / u).max() < 4
+    assert np.median(u / errors(fitted(clean))[1]) < 2
+
+
+def test_an_attitude_of_one_reading_is_refused():
+    clean = held(5, hold=40.0, count=9)
+    start = int(np.searchsorted(clean.time, 45.0))
+    with pytest.raises(DataError, match=r"of the rows of the attitude at .* are no readings \(exact repeats"):
+        fitted(frozen(clean, start, start + int(np.searchsorted(clean.time, 31.0))))
+
+
+def test_outputs_that_stand_still_by_themselves_are_not_frozen():
+    """A coarse sensor whose noise is within one step in some attitudes, and a log of changes alone."""
+    rng = np.random.default_rng(3)
+    level = np.repeat(rng.uniform(-9, 9, (40, 3)), 500, axis=0)
+    for noise in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7):
+        assert frozen_runs(np.round(level + noise * rng.standard_normal(level.shape)).T) == [], noise
+    changes = rng.random(20000) < 0.02
+    held_rows = np.maximum.accumulate(np.where(changes, np.arange(20000), 0))
+    assert frozen_runs(rng.standard_normal((3, 20000))[:, held_rows]) == []
 
 
 @pytest.mark.parametrize("kind", ["student", "low-pass", "drift"])

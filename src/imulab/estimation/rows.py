@@ -365,7 +365,10 @@ def _released(rows: NDArray[np.bool_], column: Array) -> NDArray[np.bool_]:
 
 
 def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
-    """Return the rows that repeat the row before in all columns, where the sensor itself does not repeat readings."""
+    """Return the rows that repeat the row before in all columns, where the sensor itself does not repeat readings.
+
+    Many rows do so where a link stood still: `frozen_runs`.
+    """
     n = len(values[0])
     every, by_chance = np.ones(n, dtype=np.bool_), float(n)
     every[:1] = False
@@ -376,12 +379,15 @@ def repeated_rows(values: Sequence[Array]) -> NDArray[np.bool_]:
             return every
         by_chance *= np.count_nonzero(same) / n
     count = int(np.count_nonzero(every))
-    rare = (
-        len(values) > 1
-        and count > _BEYOND_CHANCE_ZEROS * by_chance + 2 * _BEYOND_CHANCE_ZEROS * np.sqrt(by_chance)
-        and count <= MOST * n
+    beyond_chance = len(values) > 1 and count > _BEYOND_CHANCE_ZEROS * by_chance + 2 * _BEYOND_CHANCE_ZEROS * np.sqrt(
+        by_chance
     )
-    return every if rare else np.zeros_like(every)
+    if beyond_chance and count <= MOST * n:
+        return every
+    frozen = np.zeros_like(every)
+    for first, behind in frozen_runs(values) if beyond_chance else []:
+        frozen[first + 1 : behind] = True
+    return frozen
 
 
 def far_rows(values: Sequence[Array], known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -514,6 +520,31 @@ def long_runs(values: Array, least: int) -> tuple[NDArray[np.intp], NDArray[np.i
     release(values)
     long = end + 1 - first >= least
     return first[long], end[long] + 1
+
+
+def frozen_runs(columns: Sequence[Array]) -> list[tuple[int, int]]:
+    """Return first row, and row behind the last, of each run of more than 50 rows that are alike in all columns.
+
+    There are none where a column changes in fewer than half of all rows: its steps are coarser than its noise, or it is
+    slower than the log, or logged only where it changes, so that it stands still by itself.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(1).standard_normal((2, 300))
+    >>> x[:, 100:160] = x[:, 99:100]
+    >>> frozen_runs(x)
+    [(99, 160)]
+    """
+    if any(2 * count_changes(column) < len(column) for column in columns):
+        return []
+    runs = [(0, len(columns[0]))]
+    for column in columns:
+        inside: list[tuple[int, int]] = []
+        for begin, end in runs:
+            first, behind = long_runs(column[begin:end], _STUCK + 1)
+            inside += zip((begin + first).tolist(), (begin + behind).tolist(), strict=True)
+        runs = inside
+    return runs
 
 
 def count_changes(values: Array) -> int:
