@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,14 @@ def command(page: Any) -> str:
     """Return the command line of the form, once it is that of the form's values."""
     page.locator(".form:not([data-asked])").wait_for()
     return page.locator(".form .command code").inner_text()
+
+
+def await_request(page: Any, held: list[Any], seconds: float = 60) -> None:
+    """Wait until the page has asked for what a test holds back."""
+    ends = time.monotonic() + seconds
+    while not held:
+        assert time.monotonic() < ends, "the page has not asked"
+        page.wait_for_timeout(20)
 
 
 def run(page: Any) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("starlette", reason="the page needs the extra live")
 
-from benchpage import command, drop, read, run, tumble
+from benchpage import await_request, command, drop, read, run, tumble
 
 
 def arrive(page: Any, name: str) -> None:
@@ -27,8 +27,7 @@ def test_a_click_on_run_runs_what_stands_there_whatever_comes_before_the_answer(
     held: list[Any] = []
     page.route("**/api/workbench/command", lambda route: held.append(route), times=1)
     run(page)
-    while not held:
-        page.wait_for_timeout(20)
+    await_request(page, held)
     arrive(page, "late.csv")
     page.locator("[data-name='imulab-files/late.csv']").wait_for()  # and the form asks again
     command(page)
@@ -40,13 +39,14 @@ def test_a_click_on_run_runs_what_stands_there_whatever_comes_before_the_answer(
 def test_what_comes_while_the_mouse_is_down_takes_no_click(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "one.csv", "t;a\n1;x\n")
+    page.get_by_role("heading", name="one.csv").wait_for()
     drop(page, "rec.csv", tumble("own.csv"))
     read(page)
     held: list[Any] = []
     page.route("**/api/workbench/files/*", lambda route: held.append(route), times=1)
     drop(page, "late.csv", "t;a\n1;x\n")
-    while not held:
-        page.wait_for_timeout(20)
+    await_request(page, held)
+    page.get_by_label("gravity", exact=True).focus()  # which the press takes away
     page.locator("[data-name='imulab-files/one.csv']").hover()
     page.mouse.down()
     held[0].continue_()  # above it in the list, and shown unless another file is clicked on
@@ -78,8 +78,7 @@ def test_what_is_told_of_a_recording_leaves_the_form_and_its_cursor(workbench, n
     drop(page, "rec.csv", tumble("own.csv"))
     gravity = page.get_by_label("gravity", exact=True)
     gravity.press_sequentially("9.")
-    while not held:
-        page.wait_for_timeout(20)
+    await_request(page, held)
     socket[0].send(held[-1])
     page.get_by_text("attitudes at rest").wait_for()
     page.keyboard.type("81")

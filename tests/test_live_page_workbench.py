@@ -18,7 +18,7 @@ import pytest
 pytest.importorskip("starlette", reason="the page needs the extra live")
 
 import imulab as il
-from benchpage import Workbench, command, drop, read, run, tumble
+from benchpage import Workbench, await_request, command, drop, read, run, tumble
 from imulab.cli import main
 
 EVIL = "<img src=x onerror=document.title='taken'>"
@@ -211,8 +211,7 @@ def test_an_older_list_of_files_takes_no_file_off(workbench, new_page):
     page.route("**/api/workbench/files", lambda route: held.append((route, route.fetch())))
     page.reload()
     page.wait_for_function("document.querySelector('.drop')")
-    while not held:
-        page.wait_for_timeout(20)
+    await_request(page, held)
     drop(page, "phone.csv", "t;a\n1;x\n")
     entry = page.locator("[data-name='imulab-files/phone.csv']")
     entry.wait_for()
@@ -230,8 +229,7 @@ def test_a_file_that_comes_late_does_not_hide_the_one_that_was_clicked_on(workbe
     held: list[Any] = []
     page.route("**/api/workbench/files/*", lambda route: held.append(route))
     drop(page, "two.csv", "t;a\n1;x\n")
-    while not held:
-        page.wait_for_timeout(20)
+    await_request(page, held)
     page.locator("[data-name='imulab-files/one.csv']").click()
     held[0].continue_()
     page.locator("[data-name='imulab-files/two.csv']").wait_for()
@@ -375,8 +373,7 @@ def test_what_was_said_of_one_file_s_columns_is_not_said_of_the_next(workbench, 
     page.route("**/columns*", hold, times=2)
     drop(page, "unknown.csv", "t;p;q;r\n" + text.partition("\n")[2].replace(",", ";"))
     page.locator(".assistant").wait_for()
-    while not held:
-        page.wait_for_timeout(50)
+    await_request(page, held)
     drop(page, "rec.csv", text)
     read(page)
     for each in held:

@@ -39,7 +39,8 @@ let pressed = null;
 let release = null;
 const freed = () => setTimeout(() => { release?.(); pressed = release = null; }); // after the click
 addEventListener("pointerdown", event => { if (event.button === 0 && !event.target.closest?.("select")) pressed ||= new Promise(done => { release = done; }); }, true);
-for (const kind of ["pointerup", "pointercancel", "dragend", "blur"]) addEventListener(kind, freed, true);
+for (const kind of ["pointerup", "pointercancel", "dragend"]) addEventListener(kind, freed, true);
+addEventListener("blur", freed); // of the window alone: a press takes the focus from a field
 addEventListener("pointermove", event => { if (pressed && !event.buttons) freed(); }, true);
 
 export const unpressed = async () => pressed;
