@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -439,8 +440,17 @@ def test_a_link_that_is_lost_keeps_the_page_and_comes_back(live, new_page, tmp_p
 def test_a_session_that_ends_without_a_record_keeps_its_tables(live, new_page, tmp_path):
     il.write_csv(il.simulate_tumble(attitudes=5, order=1, gravity=9.81, gyro=False), tmp_path / "few.csv")
     running = live("replay:few.csv@6", *FIT, "--save", "rec.csv", "-o", "rec.json")
-    page = new_page(running.address)
-    page.wait_for_selector("#said .bad:has-text('For a record it needs at least 4 more attitudes.')")
+    page = new_page("about:blank")
+    held: list[Any] = []
+    page.route("**/api/workbench/*", lambda route: held.append(route))
+    page.goto(running.address)
+    reason = page.locator("#said .bad:has-text('For a record it needs at least 4 more attitudes.')")
+    reason.wait_for()
+    running.process.wait(30)
+    for route in held:  # it cannot be reached any more
+        route.abort()
+    page.wait_for_timeout(300)
+    assert reason.count() == 1
     assert page.inner_text(".advice") == "The session has ended without a record."
     assert page.locator("section:has(> h2:text-is('Attitudes')) tbody tr").count() == 5
     assert "rec.csv keeps 5 attitudes: --resume goes on with it." in page.inner_text("main")

@@ -23,6 +23,7 @@ let refused = ""; // that of the message whose refusal stands above the page
 let refusedAt = 0;
 
 function say(text, kind = "note") {
+  if (ended) return; // it stays why
   refused = "";
   const place = document.getElementById("said");
   if (place.textContent === text) return;
@@ -46,8 +47,8 @@ const page = {
   others: () => Object.keys(mounted),
   // Says that the program ends by itself now, and why: that it is gone is then no news.
   end(text, kind) {
-    ended = true;
     say(text, kind);
+    ended = true;
   },
 };
 
