@@ -284,6 +284,16 @@ def test_a_clock_is_not_asked_for_where_the_table_wrote_its_rate_too():
     assert not any("table_angle" in w for w in record.warnings)
 
 
+@pytest.mark.parametrize(("listed", "said"), [([0, 100, 0], False), ([0, 0, 0], True)])
+def test_a_run_of_three_dwells_goes_beside_a_longer_one(listed, said):
+    short = by_angle(0.0, way=[0, 100, 0])
+    runs = (Run("angle.csv", "+z", rates=tuple(DEGREE * np.array(listed))), Run("z.csv", "+z"))
+    test = RateTest(runs, latitude=0.0)
+    record = il.fit_rate(RateRecordings(test, (short, recording("+z")), {})).calibration
+    assert record.value("gyro_scale_factor_z") == pytest.approx(SCALE[2], rel=1e-3)
+    assert any("table_angle became a rate" in w for w in record.warnings) == said
+
+
 def test_the_scatter_of_scale_factors_from_cycle_to_cycle_is_in_their_uncertainty():
     runs = [il.simulate_rate(faces="+z", noise="0.001 deg/s", hold="3 s", rate="50 Hz", seed=1) for _ in range(4)]
     made = []

@@ -43,6 +43,7 @@ _SHAPES: tuple[Callable[[Array], Array], ...] = (
 def fit_weighted(columns: Array, values: Array, variance: Array) -> tuple[Array, Array]:
     """Return the residual of a weighted fit, and its coefficients with their covariance, shape (p, p + 1)."""
     weight, size = 1 / np.sqrt(variance), np.abs(columns).max(axis=0)
+    size = np.where(size > 0, size, 1.0)  # that of a run without dwells here is 0
     scaled = columns / size * weight[:, None]
     inverse = np.linalg.pinv(scaled)
     coefficients = inverse @ (values * weight) / size

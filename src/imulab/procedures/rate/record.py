@@ -338,7 +338,11 @@ def _warn_clock(test: RateTest, recordings: Sequence[Recording], dwells: Sequenc
         return []
     stated = test.relative_uncertainty
     runs = zip(test.runs, dwells, by_angle, strict=True)
-    pairs = [(run.rates, reduced.rate) for run, reduced, angle in runs if angle and run.rates and reduced.sweep is None]
+    pairs = [
+        (run.rates, reduced.rate)
+        for run, reduced, angle in runs
+        if angle and run.rates and any(run.rates) and reduced.sweep is None
+    ]
     if not pairs:
         if stated is not None:
             return [
