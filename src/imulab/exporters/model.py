@@ -110,7 +110,7 @@ def refuse_raw(unit: UnitModel, target: str) -> None:
 
 
 def check_si(target: str, sensors: str, unit: str) -> None:
-    """Refuse accelerometers or gyroscopes with outputs in another unit than that of an autopilot's logs; as above."""
+    """Refuse accelerometers or gyroscopes with outputs that are not in SI; errors as for `refuse_raw`."""
     if unit not in ("m/s^2", "rad/s"):
         raise OptionError(
             f"{target}: corrects outputs in {'m/s^2' if sensors == 'accelerometers' else 'rad/s'}, but the record is "

@@ -465,9 +465,10 @@ class DoubtfulSamples:
                 continue
             self._finite[column] = self._finite.get(column, False) or bool(np.isfinite(values).any())
             if (infinite := np.flatnonzero(np.isinf(values))).size:
-                found = f"{block.place(infinite[0])}, column {column}: expected a number, found {values[infinite[0]]}"
-                first, before = self._infinite.get(column, (found, 0))
-                self._infinite[column] = first, before + infinite.size
+                row = infinite[0]
+                message = f"{block.place(row)}, column {column}: expected a number, found {values[row]}"
+                first, count = self._infinite.get(column, (message, 0))
+                self._infinite[column] = first, count + infinite.size
 
     def warnings(self) -> list[str]:
         """Return a sentence on each kind of them."""

@@ -90,7 +90,7 @@ def slower_noise(noises: Mapping[str, ColumnNoise], rest: AtRest) -> float:
 
 
 def slower_noise_text(times: float, uncertainties: Array, duration: float) -> str:
-    """Say so of uncertainties of biases, rad/s, by a test of a duration, s."""
+    """Return the sentence on that, for uncertainties of biases, rad/s, by a test of a duration, s."""
     largest = math.degrees(float(np.nanmax(uncertainties))) * 3600
     return (
         f"the uncertainties of the biases, up to {largest:.3g} deg/h, hold "

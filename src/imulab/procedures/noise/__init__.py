@@ -47,7 +47,7 @@ def check_terms(text: str, called: str = "terms") -> str:
 
 
 def spelled(letters: str) -> str:
-    """Return a model in words, and its letters: ``white + random walk (NK)``."""
+    """Return a model in words, and its letters: ``white noise + random walk (NK)``."""
     return f"{' + '.join(LETTERS[letter] for letter in letters)} ({letters})"
 
 

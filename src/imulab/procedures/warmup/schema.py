@@ -75,7 +75,8 @@ class WarmupSummary(Part):
         for row in self.models:
             if row.chosen if model is None else row.model == model:
                 return row
-        raise LackingError(f"fit.models lacks {'the chosen model' if model is None else f'model {model}'}")
+        which = "the chosen model" if model is None else f"model {model}"
+        raise LackingError(f"the record lacks {which} in fit.models")
 
 
 class HeldTable(Part):

@@ -543,7 +543,7 @@ function worked(job) {
     ui.jobs.prepend(found.element);
     show(ui.clear, true);
     if (Date.now() / 1000 - job.began < 5) {
-      const settings = ui.form?.querySelector("details.settings");
+      const settings = ui.form.querySelector("details.settings");
       if (settings && settings.querySelector("summary").textContent === job.path) settings.open = false;
       found.element.scrollIntoView({ block: "start" });
     }

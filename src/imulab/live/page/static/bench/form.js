@@ -137,7 +137,7 @@ function field(of, files, value, changed) {
     of, read, element: h("div", { class: `field ${of.kind}` }, label(more.title || title), control, help), ...more,
   });
   const options = (chosen, empty) => [
-    empty === null ? null : h("option", { value: "" }, empty),
+    h("option", { value: "" }, empty),
     ...files().filter(each => !["folder", "report"].includes(each.kind)).map(each => h("option", { value: each.name, selected: each.name === chosen }, each.folder ? `${each.folder.slice(each.folder.lastIndexOf("/") + 1)}/${each.short}` : each.short)),
   ];
 
