@@ -5,6 +5,7 @@ import math
 import re
 import warnings
 from html import unescape
+from pathlib import Path
 
 import allantools
 import numpy as np
@@ -20,7 +21,7 @@ from imulab.estimation.column_noise import analyse, columns_noise, noise_lines
 from imulab.estimation.noise.simulate import simulated
 from imulab.estimation.noise_coefficients import allan_deviation
 from imulab.estimation.sampling import sampling_rate
-from imulab.recording import Recording
+from imulab.recording import Recording, on_disk
 from imulab.report.noise_figures import exhibits_of_noise, interval
 from imulab.report.traces import Figure
 
@@ -372,6 +373,22 @@ def test_the_check_report_says_pass_or_fail_first(imulab, tmp_path, gravity, ver
     for _, residual, u, ratio in rows:
         (a, unit_a), (b, unit_b) = residual.split(), u.split()
         assert float(a) * size[unit_a] / (float(b) * size[unit_b]) == pytest.approx(float(ratio), abs=0.06, rel=0.02)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells what a process has in memory")
+def test_memory_of_columns_on_disk_is_given_back_after_each():
+    def mapped():
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(status.partition("RssFile:")[2].split()[0])
+
+    n, names = 1 << 18, [f"gyro_{k}" for k in range(1, 9)]
+    rng = np.random.default_rng(1)
+    block = Recording({name: rng.standard_normal(n) for name in names}, dict.fromkeys(names, "rad/s"))
+    recording = on_disk(iter([block]))
+    columns_noise([block.column(names[0])], 100.0)  # what it imports is a file, too
+    before = mapped()
+    columns_noise([recording.column(name) for name in names], 100.0)
+    assert mapped() - before < 4 * 8 * n  # of eight columns
 
 
 def test_a_single_row_is_refused_without_a_warning_of_numpy(tmp_path, capsys):

@@ -30,7 +30,7 @@ from imulab.estimation.noise_coefficients import (
 )
 from imulab.estimation.rows import Step, deviation_of_steps, find_step, leave_out, resolution
 from imulab.estimation.sampling import bridged, mend_stamps, sampling_rate, steady_part
-from imulab.recording import Array, Recording, check_not_resampled
+from imulab.recording import Array, Recording, check_not_resampled, release
 from imulab.units import from_si, parse_unit, si_unit, to_si
 
 _STILL = {"rate": (math.radians(5.0), "deg/s"), "acceleration": (1.0, "m/s^2")}
@@ -260,6 +260,7 @@ def columns_noise(
     for samples, unit, curve, reason in zip(columns, units, curves, moved or repeat(""), strict=False):
         why.append(reason or _unfit(samples, float(curve.deviation[0]) / to_si(1.0, unit)))
         stretches += [] if why[-1] else [[transformed(samples, 1 / rate, unit=unit)]]
+        release(samples)
     fit = [k for k, reason in enumerate(why) if not reason]
     analysed_columns = analyses(stretches, candidates) if fit else []
     models = dict(zip(fit, zip(read_coefficients(analysed_columns), analysed_columns, strict=True), strict=True))
