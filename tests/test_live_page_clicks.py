@@ -36,6 +36,30 @@ def test_a_click_on_run_runs_what_stands_there_whatever_comes_before_the_answer(
     assert "--order 1" in page.locator(".job .command code").text_content()
 
 
+def test_a_run_that_is_answered_late_leaves_the_form_of_the_file_that_is_shown_by_then(workbench, new_page):
+    page = new_page(workbench.address)
+    text = tumble("own.csv")
+    for name in ("other.csv", "rec.csv"):
+        drop(page, name, text)
+        page.get_by_role("heading", name=name).wait_for()
+        read(page)
+        if name == "other.csv":
+            page.locator("[data-path='allan']").click()
+        command(page)
+    held: list[Any] = []
+    page.route("**/api/workbench/command", lambda route: held.append(route), times=1)
+    run(page)
+    await_request(page, held)
+    page.locator("[data-name='imulab-files/other.csv']").click()
+    page.get_by_role("heading", name="other.csv").wait_for()
+    read(page)
+    held[0].continue_()
+    page.locator(".job .found").wait_for()
+    page.locator("[data-name$='.json']").wait_for()  # a record, by which what can be done is found anew
+    command(page)
+    assert page.locator(".settings > summary").inner_text() == "allan"
+
+
 def test_what_comes_while_the_mouse_is_down_takes_no_click(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "one.csv", "t;a\n1;x\n")

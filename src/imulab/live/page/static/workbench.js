@@ -477,7 +477,10 @@ function fill(definition, given = {}) {
   }
   current = form(definition, {
     files: () => files, values, keep: typed => keep("values", key, typed),
-    run: async typed => { noted(definition, false); await start(definition.path, typed); },
+    run: async typed => {
+      if (filled === formKey(definition)) noted(definition, false); // another file may be shown by now
+      await start(definition.path, typed);
+    },
   });
   ui.form.replaceChildren(h("details", { class: "settings", open: true }, h("summary", {}, h("strong", {}, definition.path)), current.element));
 }
