@@ -302,7 +302,7 @@ def test_the_attitudes_that_would_help_do_help():
     truth = {n: (1.0 if n[0] == "s" else 0.0) for n in reference.names(1)}
     with pytest.raises(ObservabilityError) as caught:
         fit(outputs(truth, 1, np.vstack([FACES, EDGES])), 1)
-    advice = str(caught.value).split("upward direction near ")[1].split(" would help")[0]
+    advice = str(caught.value).split("upward directions ")[1].split(" would help")[0]
     added = np.array([[float(x) for x in part.strip("()").split(",")] for part in advice.split(" and ")])
     added /= np.linalg.norm(added, axis=1, keepdims=True)
     found = fit(outputs(truth, 1, np.vstack([FACES, EDGES, added])), 1)
