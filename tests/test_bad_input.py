@@ -72,7 +72,7 @@ CASES = {
     "too few attitudes": (
         lambda r: first_rows(r, 2000),
         ["bad.csv: 5 attitudes determine 5 of the 9 parameters of order 1; they cannot separate ", "misalignment_z",
-         "and 3 more; upward directions (", "would help most"],
+         "and 1 more; upward directions (", "would help most"],
     ),
     "no attitude at all": (
         lambda r: changed(r, **{f"accel_{a}": r.columns[f"accel_{a}"] + 3 * np.sin(9 * r.columns["time"]) *

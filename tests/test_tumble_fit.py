@@ -295,7 +295,13 @@ def test_a_blind_fixture_is_refused_with_the_parameters_it_cannot_separate(direc
     assert f"of the {3 * (order + 2)} parameters of order {order}" in message
     assert named <= set(message.replace(";", " ").split())
     assert "would help most" in message
-    assert len(message.removeprefix("table.csv: ").split()) <= 35
+    assert len(message.removeprefix("table.csv: ").split()) <= 37
+
+
+def test_six_faces_at_order_2_are_told_a_power_that_they_cannot_separate():
+    truth = reference.random_truth(np.random.default_rng(80), 1) | dict.fromkeys(reference.names(2)[9:], 0.0)
+    with pytest.raises(ObservabilityError, match=r" k2_[xyz]\b.* and 3 more; upward directions"):
+        fit(outputs(truth, 2, FACES), 2)
 
 
 def test_the_attitudes_that_would_help_do_help():

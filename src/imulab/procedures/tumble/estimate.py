@@ -412,7 +412,7 @@ def _solve(
     if ranks.rank < size:
         names = parameter_names(problem.order, problem.cross)
         confused = ranks.confused(names)
-        shown = first_of(confused, 6, " ")
+        shown = first_of(confused, 8, " ")  # by six faces, at order 2: k2_z is the eighth
         help_from = helpful_attitudes(problem.order, solution, count=2)
         many = f"{n} attitudes determine" if n != 1 else "1 attitude determines"
         raise ObservabilityError(
