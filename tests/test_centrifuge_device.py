@@ -122,7 +122,7 @@ def test_apply_warns_once_beyond_the_highest_level(record, imulab, tmp_path):
     done = imulab("apply", "r.json", "f.csv", "-o", "c.csv")
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("warning") == 1
-    assert "f.csv: 2 samples beyond 20 g (up to 30.0 g), the highest level" in done.stderr
+    assert "f.csv: 2 samples beyond 20 g (up to 30 g), the highest level" in done.stderr
 
 
 def test_the_record_keeps_the_contract(record, tmp_path):

@@ -643,12 +643,12 @@ def test_readings_that_are_lost_or_beyond_the_test_are_said_by_command_and_funct
     monkeypatch.chdir(tmp_path)
     truth, _, outputs = simulated(2, "m/s^2")
     outputs *= 0.3
-    outputs[50, 1], outputs[20:22, 0], outputs[90, 0], outputs[:, 2] = 40.0, np.inf, -np.inf, np.nan
+    outputs[50, 1], outputs[20:22, 0], outputs[90, 0], outputs[:, 2] = 4e30, np.inf, -np.inf, np.nan
     made, held = record(truth, 2, "m/s^2"), recording(outputs, "m/s^2", gyro_x=(np.full(200, np.inf), "rad/s"))
-    force = (40.0 / truth["scale_factor_y"] - truth["bias_y"]) / G
+    force = (4e30 / truth["scale_factor_y"] - truth["bias_y"]) / G
     lost = "what is corrected with it is not a number there"
     lines = [
-        f"flight.csv: 1 samples beyond 2 g (up to {force:.1f} g): the record's nonlinearity was measured within 1 g",
+        f"flight.csv: 1 samples beyond 2 g (up to {force:.4g} g): the record's nonlinearity was measured within 1 g",
         f"flight.csv: row 21 (line 23), column accel_x: expected a number, found inf (and 2 more): {lost}",
         f"flight.csv: column accel_z: expected numbers, found none in 200 rows: {lost}",
     ]

@@ -110,13 +110,14 @@ def test_rates_beyond_the_test_are_told(tmp_path, monkeypatch, capsys):
     il.fit_rate(
         whole(powers=(np.zeros(3), np.full(3, 3e-5)), noise=1e-5, rng=np.random.default_rng(1))
     ).calibration.save("r.json")
-    for speed, said in ((195.0, False), (300.0, True)):
+    for speed, said in ((195.0, False), (300.0, True), (np.inf, False)):  # what is infinite is said by itself
         flight = il.Recording.from_arrays(gyro=np.full((50, 3), speed), rate=100.0, units={"gyro": "deg/s"})
         il.write(flight, "f.csv")
         capsys.readouterr()
         assert main(["apply", "r.json", "f.csv", "-o", "out.csv"], project=False) == 0
         error = capsys.readouterr().err
         assert ("50 samples beyond 200 deg/s (up to 3" in error) == said
+        assert ("samples beyond" in error) == said
 
 
 def test_the_threshold_is_the_least_rate_that_shows():

@@ -417,8 +417,9 @@ def beyond_rates(record: Calibration, recording: Recording) -> tuple[int, float]
         if (name := f"gyro_{axis}") in recording:
             factor = conversion_factor(recording.units[name], record.model["gyro_output_unit"])
             rate = recording.column(name) * (factor / record.value(f"gyro_scale_factor_{axis}"))
-            sizes.append(np.abs(rate - record.value(f"gyro_bias_{axis}")))
-    size = np.fmax.reduce(sizes)
+            size = np.abs(rate - record.value(f"gyro_bias_{axis}"))
+            sizes.append(np.where(np.isfinite(size), size, 0.0))
+    size = np.maximum.reduce(sizes)
     return int(np.count_nonzero(size > _BEYOND * record.model["largest_rate"]["value"])), float(size.max(initial=0.0))
 
 

@@ -128,7 +128,7 @@ def beyond_levels(record: Calibration, recording: Recording) -> tuple[int, float
 def beyond_message(record: Calibration, count: int, largest: float) -> str:
     """Return the warning of samples beyond the highest level, the largest in m/s^2."""
     return (
-        f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {from_si(largest, 'g'):.1f} g), "
+        f"{count} samples beyond {from_si(highest_force(record), 'g'):.4g} g (up to {from_si(largest, 'g'):.4g} g), "
         "the highest level of the record's test: K(a) is extrapolated there"
     )
 

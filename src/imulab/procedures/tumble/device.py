@@ -223,7 +223,7 @@ def beyond_test(record: Calibration, recording: Recording) -> tuple[int, float]:
 
 def beyond_message(record: Calibration, count: int, largest: float) -> str:
     """Say that so many samples, the largest in m/s^2, lie beyond what shows the nonlinearity."""
-    most = f"{from_si(largest, 'g'):.1f} g"
+    most = f"{from_si(largest, 'g'):.4g} g"
     return f"{count} samples beyond 2 g (up to {most}): the record's nonlinearity was measured within 1 g"
 
 
