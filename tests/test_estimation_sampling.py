@@ -32,6 +32,9 @@ def noise(time, unit="s", seed=1):
         (0.1, "s", ""),
         (0.2, "s", "5000 Hz if it is in ms"),
         (0.19, "s", ""),
+        (1 / 32_000, "s", ""),
+        (1 / 32, "ms", "32 Hz if it is in s"),
+        (1 / 50_000, "s", "(5e+04 Hz): is the unit of time right?"),
         (200.0, "s", "(0.005 Hz): is the unit of time right: 5 Hz if it is in ms or 5000 Hz if it is in us?"),
     ],
 )

@@ -31,7 +31,9 @@ _COARSE = 0.2  # share of steps beyond the limit from which time stamps are coar
 _BLOCKS, _SMALLEST_BLOCK = 100, 100  # blocks whose usual steps show a change of rate; fewest steps of a block
 _MORE_IN_BURSTS = 10  # times as many steps of a block where stamps come in bursts
 SAME_RATE = 0.05  # relative: parts of a recording whose steps are this close have one rate
-_SLOWEST, _FASTEST = 0.5, 20_000.0  # Hz: at rates beyond, the unit of time is doubted
+_SLOWEST, _FAST, _FASTEST = 0.5, 20_000.0, 40_000.0
+"""Rates, Hz: at the first and last the unit of time is doubted; between the others, gyroscopes of 32 kHz being made,
+where another unit makes rate and duration likely."""
 KILOHERTZ_IN_MS = 2.0
 """Rate, Hz, up to which samples at 1 or 2 kHz seem to come whose times in ms are titled s."""
 TOO_SLOW = 5.0
@@ -366,7 +368,7 @@ def mislabelled(
     doubt = doubt_unit_of_time(recording.units["time"], rate, duration, rare=slow or short, odd=odd)
     if not doubt:
         return []
-    kind = Finding if odd or short else Note
+    kind = Finding if odd or short or rate > _FAST else Note
     return [
         kind(
             f"{doubt} If not, every figure that depends on time is wrong",
@@ -385,10 +387,10 @@ def doubt_unit_of_time(unit: str, rate: float, duration: float, *, rare: bool = 
     rare
         Whether to ask where another unit makes rate and duration likely.
     odd
-        Whether to ask anyhow; where the rate is none from 0.5 Hz to 20 kHz if None.
+        Whether to ask anyhow; where the rate is none from 0.5 Hz to 40 kHz if None.
     """
     odd = not _SLOWEST < rate < _FASTEST if odd is None else odd
-    if not odd and not (rare and likely_times(unit, rate, duration)):
+    if not odd and not ((rare or rate > _FAST) and likely_times(unit, rate, duration)):
         return ""
     asked = ask_unit_of_time(unit, rate, duration)
     return f"column time [{unit}]: {1 / rate:.3g} s from row to row ({rate:.3g} Hz): {asked}"
