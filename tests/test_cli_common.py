@@ -65,7 +65,7 @@ def test_the_short_help_leaves_out_what_few_runs_need(capsys):
     [
         (["tumbel"], "; did you mean 'tumble'?"),
         (["tumble", "fitt"], "; did you mean 'fit'?"),
-        (["calibrate"], "No such command 'calibrate'; expected array calibrate"),
+        (["calibrate"], "; expected array calibrate"),
         (["check"], "expected tumble check, noise check, thermal check, magnetometer check"),
         (["simulte"], "; did you mean 'simulate'?"),
         (["fleet", "simulte"], "; did you mean 'simulate'?"),

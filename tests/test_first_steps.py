@@ -253,9 +253,7 @@ def test_another_instruments_file_gives_what_our_own_gives(imulab, tmp_path, rec
         )
 
 
-@pytest.mark.parametrize(
-    "command", ["report t.json -o", "tumble fit t.csv --gravity 9.81 -o s.json --report", "fleet report . -o"]
-)
+@pytest.mark.parametrize("command", ["report t.json -o", "tumble fit t.csv --gravity 9.81 -o s.json --report"])
 def test_a_report_is_html(imulab, tmp_path, recording, command):
     il.write_csv(recording, tmp_path / "t.csv")
     il.fit_tumble(recording, gravity=9.81, order=1).calibration.save(tmp_path / "t.json")

@@ -517,6 +517,10 @@ def test_no_report_is_written_over_a_record(imulab, tmp_path):
         done = imulab("fleet", "report", "out", "-o", name)
         assert done.returncode == 2
         assert done.stderr.startswith(f"imulab: {name}: would overwrite ")
+    done = imulab("fleet", "report", "out", "-o", "r.txt")
+    assert done.returncode == 2
+    assert done.stderr == "imulab: r.txt: a report is HTML; expected a name that ends in .html\n"
+    assert not (tmp_path / "r.txt").exists()
     done = imulab("fleet", "run", "in/manifest.csv", "-o", "out", "--workers", 1, "--table", "out/SN001.json")
     assert done.returncode == 2
     assert all(path.read_bytes() == data for path, data in before.items())

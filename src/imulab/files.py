@@ -104,7 +104,7 @@ def check_no_paper(path: str | Path) -> None:
 def check_page(path: str | Path) -> None:
     """Refuse the name of a file that promises something else than an HTML page; errors as for `check_no_paper`."""
     check_no_paper(path)
-    if Path(path).suffix.lower() not in (".html", ".htm") and not Path(path).is_dir():
+    if Path(path).suffix.lower() not in (".html", ".htm", "") and not Path(path).is_dir():
         raise OptionError(f"{path}: a report is HTML; expected a name that ends in .html")
 
 

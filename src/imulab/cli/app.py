@@ -123,9 +123,8 @@ def _names(group: str) -> list[str]:
 def _no_command(word: str, group: str) -> OptionError:
     known = _names(group)
     second = {} if group else {name: _names(name) for name in known}
-    if begun := [f"{name} {word}" for name, names in second.items() if word in names]:
-        return OptionError(f"No such command '{word}'; expected {', '.join(begun)}")
-    near = meant([*known, *chain.from_iterable(second.values())], word)
+    begun = [f"{name} {word}" for name, names in second.items() if word in names]
+    near = f"; expected {', '.join(begun)}" if begun else meant([*known, *chain.from_iterable(second.values())], word)
     return OptionError(f"No such command '{word}'; known commands: {' '.join(known)}{near}")
 
 

@@ -83,7 +83,7 @@ def report(
 
     Distributions, outliers, drift, Cpk, and what changed since the last calibration.
     """
-    check_outputs([], [options["limits"]] if options["limits"] else [], report=output)
+    check_outputs([output], [options["limits"]] if options["limits"] else [])
     il.write_fleet_report(folder, output, **options)
     print(f"report: {output}")
 
