@@ -229,6 +229,9 @@ HYSTERESIS_SCATTERS = Decision(
 DWELLS_SCATTER = Decision(
     0.01, "uncertainty", {"rate": 4}, "dwells scatter beyond their noise, which is added to each and noted"
 )
+ZEROS_WALK = Decision(
+    0.01, "uncertainty", {"rate": 6}, "zeros walk over a run, by all dwells and by those about other axes"
+)
 RUNS_SCATTER = Decision(0.01, "uncertainty", {"rate": 1}, "scale factors differ from run to run beyond their noise")
 TURNS_SCATTER = Decision(0.01, "uncertainty", {"rate turn": 3}, "whole turns about an axis scatter beyond their noise")
 TURNS_LOSE_SAMPLES = Decision(

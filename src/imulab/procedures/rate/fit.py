@@ -200,7 +200,9 @@ def fit_test(
     linearity = {}
     for i in measured:
         scale = float(solution.coefficients[i][problem.faces.index(problem.gyros[i])])
-        linearity[AXES[problem.gyros[i]]] = measure_linearity(_subtract_lean(problem, solution), i, scale, orders[i])
+        linearity[AXES[problem.gyros[i]]] = measure_linearity(
+            _subtract_lean(problem, solution), i, scale, orders[i], float(solution.walk[i])
+        )
     record = make_record(test, recordings, dwells, problem, solution, linearity, unit, order, axes)
     if prior is not None:
         record = with_prior(record, prior_at(prior, recordings), str(record.model["frame"]))

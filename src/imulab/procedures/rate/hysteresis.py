@@ -101,6 +101,7 @@ def fit_loop(
     runs: NDArray[Any],
     time: Array,
     direction: NDArray[np.int64],
+    walk: float = 0.0,
 ) -> tuple[float, tuple[float, float]] | None:
     """Return the probability that noise alone makes such a loop, and h and its standard uncertainty; None without one.
 
@@ -112,11 +113,14 @@ def fit_loop(
         Outputs over scale factor and largest rate, and the variances of their noise, shape (n,).
     key, runs, time, direction
         Which rate and run; middle of the dwell, s; and `find_directions`, shape (n,).
+    walk
+        Variance per second by which the zero walks at least, as dwells about other axes show it.
     """
     apart = (direction == 0) & (np.abs(rate) < 1 - 1e-9)  # dwells on a branch that is not known
     beside = np.column_stack([key[:, None] == np.unique(key), np.eye(len(rate))[:, apart]]).astype(np.float64)
     shapes = np.column_stack([direction * shape(np.abs(rate)) for shape in _SHAPES])
-    fitted = _fit_shapes(shapes, beside, rate, values, np.diag(variance), runs, time)
+    noise = np.diag(variance) - walk / 2 * np.abs(time[:, None] - time) * (runs[:, None] == runs)
+    fitted = _fit_shapes(shapes, beside, rate, values, noise, runs, time)
     return None if fitted is None else (fitted[2], (2 * fitted[0], 2 * fitted[1]))
 
 
@@ -153,7 +157,7 @@ def _fit_shapes(
     within = time - np.array([time[runs == run].min() for run in number])[which]
     of_run = np.eye(len(number))[which]
     nuisance = np.column_stack([beside, of_run, of_run * within[:, None]])
-    free = _null_space((nuisance / np.maximum(np.abs(nuisance).max(axis=0), 1e-300)).T)
+    free = null_space((nuisance / np.maximum(np.abs(nuisance).max(axis=0), 1e-300)).T)
     shapes = free.T @ shapes
     if free.shape[1] < 2 or not (np.sum(shapes**2, axis=0) > 1e-9).all():
         return None
@@ -185,7 +189,7 @@ def _average_models(
     return mean, spread, 2 * float((weight * normal_cdf(-np.abs(value) / u)).sum())
 
 
-def _null_space(rows: Array) -> Array:
+def null_space(rows: Array) -> Array:
     """Return an orthonormal basis of the vectors that all rows are normal to, shape (n, k)."""
     _, spread, turn = np.linalg.svd(rows)
     rank = int(np.sum(spread > 1e-9 * spread[0]))

@@ -5,7 +5,8 @@ Model of gyroscope i: ``M_i = S_i (A_i + b_i)``, ``A_i = s_i + k2_i s_i^2 + ...`
 Fit (`solve`): in a run whose table axis is body axis j the mean output is ``B_ij w``, ``B = diag(S) T``, plus the zero
 of that run, and for j = i powers of w. The covariance of the means is the sum of their noise; of the errors of
 commanded rates, which all visits and all gyroscopes share; of the horizontal part of the Earth's rate, as far as the
-table's turning does not average it; and of an added variance where the dwells scatter beyond these.
+table's turning does not average it; and of an added variance where the dwells scatter beyond these, or of zeros that
+walk.
 
 Order (`choose_orders`): residuals are compared rate by rate, since all visits share the error of a commanded rate and
 are no further evidence of a bend.
@@ -14,7 +15,8 @@ Nonlinearity, asymmetry, hysteresis (`measure_linearity`) are fractions of the l
 that the uncertainty that all rates share drops out; docs/rate.md defines them.
 
 Sources: IEEE Std 528 (terms); Aitken (1935), generalised least squares; Mandel and Paule, Anal. Chem. 42 (1970) 1194,
-added variance; F-test of nested models and leave-one-out prediction.
+added variance; Patterson and Thompson, Biometrika 58 (1971) 545, restricted likelihood; F-test of nested models and
+leave-one-out prediction.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from imulab.estimation.decisions import (
     RATES_SCATTER_AS_NOISE,
     RUNS_SCATTER,
     SLOPES_KINK,
+    ZEROS_WALK,
 )
 from imulab.estimation.least_squares import chi_square_probability, coverage_factor, f_test
 from imulab.gravity import EARTH
@@ -45,6 +48,7 @@ from imulab.procedures.rate.hysteresis import (
     fit_hysteresis,
     fit_loop,
     fit_weighted,
+    null_space,
     test_bend,
     test_one_rate,
     test_visits,
@@ -59,6 +63,7 @@ from imulab.units import STANDARD_GRAVITY, parse_unit
 
 _HALVINGS = 60  # of a bracket, at most; 0.1 % of its end is enough
 EXACT = 1e-10  # of the largest reading: noise that is assumed of data without noise
+_WALKS = np.geomspace(0.1, 1e8, 60)  # variances of a walk or scatter over that of noise that are tried
 _MOST_POWERS = 5  # powers of the rate in the model by which scatter is judged
 
 
@@ -149,6 +154,8 @@ class RateSolution:
         Highest power of the rate of each gyroscope.
     scatter
         Standard deviation that was added to each dwell, for each gyroscope, output.
+    walk
+        Variance per second by which its zero walks, as dwells about other axes show it, output^2/s, shape (g,).
     cycle
         Relative standard deviation of scale factors from run to run of one axis; 0 where noise explains it.
     cycle_freedom
@@ -161,6 +168,7 @@ class RateSolution:
     covariance: Array
     orders: tuple[int, ...]
     scatter: Array
+    walk: Array
     cycle: float
     cycle_freedom: int | None
     chi_square: float
@@ -196,13 +204,18 @@ def solve(problem: RateProblem, orders: Sequence[int]) -> RateSolution:
     blocks = _shared_covariance(problem, gains)
     variance = problem.variance + (EXACT * np.abs(problem.mean).max()) ** 2
     scatter, chi_square, freedom = np.zeros(count), 0.0, 0
+    walk, walks, across = _covariance_of_walk(problem), [], np.zeros(count)
     for i in range(count):
         columns = design(problem, i, most)
         base = np.diag(variance[:, i]) + blocks[i, i]
-        scatter[i], axis_chi_square = _fit_scatter(columns, problem.mean[:, i], base)
+        across[i] = _fit_walk(problem, i, most, base, walk, problem.axis != problem.gyros[i])
+        walks.append(_fit_walk(problem, i, most, base, walk, problem.axis >= 0) * walk)
+        axis_chi_square = _fit_generalised(columns, problem.mean[:, i], base)[2]
+        scatter[i] = _fit_scatter(columns, problem.mean[:, i], base + walks[i])[0]
+        blocks[i, i] = blocks[i, i] + walks[i]
         chi_square, freedom = chi_square + axis_chi_square, freedom + len(columns) - columns.shape[1]
     variance = variance + scatter**2
-    cycle, cycle_freedom = _fit_run_scatter(problem, most, variance, gains)
+    cycle, cycle_freedom = _fit_run_scatter(problem, walks, variance, gains)
     for i in range(count):
         own_rate = np.where(problem.axis == problem.gyros[i], problem.rate * _own_scale_factor(problem, gains, i), 0.0)
         same = problem.run[:, None] == problem.run
@@ -215,7 +228,7 @@ def solve(problem: RateProblem, orders: Sequence[int]) -> RateSolution:
     estimates, matrix, _ = _fit_generalised(columns, problem.mean.T.ravel(), whole)
     ends = np.cumsum([0, *(design(problem, i, orders[i]).shape[1] for i in range(count))])
     coefficients = [estimates[a:b] for a, b in pairwise(ends)]
-    return RateSolution(coefficients, matrix, tuple(orders), scatter, cycle, cycle_freedom, chi_square, freedom)
+    return RateSolution(coefficients, matrix, tuple(orders), scatter, across, cycle, cycle_freedom, chi_square, freedom)
 
 
 def subtract_lean(problem: RateProblem, gains: Sequence[Array]) -> Array:
@@ -278,6 +291,56 @@ def _fit_generalised(columns: Array, values: Array, covariance: Array) -> tuple[
     return estimate / size, inverse @ inverse.T / np.outer(size, size), float(left @ left)
 
 
+def _covariance_of_walk(problem: RateProblem) -> Array:
+    """Return the covariance over dwells of zeros that walk by 1 per sqrt(s), shape (n, n): ``(T - |t - t'|) / 2``.
+
+    T is the time from the first dwell of a run to the last, so that the zero of a run is that at its begin or end.
+    0 where times are not known, and for sweeps, whose means by rate are of all times.
+    """
+    covariance = np.zeros((len(problem.rate), len(problem.rate)))
+    for run in range(problem.runs):
+        which = np.flatnonzero(problem.run == run)
+        if problem.time is not None and (problem.reach is None or not problem.reach[which].any()):
+            time = problem.time[which]
+            covariance[np.ix_(which, which)] = (np.ptp(time) - np.abs(time[:, None] - time)) / 2
+    return covariance
+
+
+def _fit_walk(problem: RateProblem, gyro: int, order: int, base: Array, walk: Array, where: NDArray[np.bool_]) -> float:
+    """Return the factor of `walk` that explains the dwells `where`, 0 where noise or scatter explain them as well.
+
+    It is of greatest restricted likelihood. Each run has a slope of its own, since a mounting or a scale factor that
+    differs from run to run is no walk.
+    """
+    if not walk[where][:, where].any():
+        return 0.0
+    slopes = problem.rate[:, None] * (problem.run[:, None] == np.arange(problem.runs))
+    columns, values = np.column_stack([design(problem, gyro, order), slopes])[where], problem.mean[where, gyro]
+    base, walk = base[where][:, where], walk[where][:, where]
+    usual = np.diag(base).mean() * _WALKS
+    sizes = usual / np.diag(walk).mean()
+    gains = _gain_likelihood(columns, values, base, walk, sizes)
+    if (
+        gains.max() < coverage_factor(None, 1 - 2 * ZEROS_WALK.level) ** 2
+        or gains.max() < _gain_likelihood(columns, values, base, np.eye(len(base)), usual).max()
+    ):
+        return 0.0
+    return float(sizes[gains.argmax()])
+
+
+def _gain_likelihood(columns: Array, values: Array, base: Array, part: Array, sizes: Array) -> Array:
+    """Return by how much ``base + x part`` makes twice the log restricted likelihood larger, for each size x.
+
+    Residuals that are free of the columns, and independent by both covariances, have variances ``1 + x r``.
+    """
+    inverse = np.linalg.inv(np.linalg.cholesky(base))
+    free = inverse.T @ null_space((inverse @ columns / np.maximum(np.abs(columns).max(axis=0), 1e-300)).T)
+    ratios, axes = np.linalg.eigh(free.T @ part @ free)
+    squares = (axes.T @ (free.T @ values)) ** 2
+    variances = 1 + sizes[:, None] * np.maximum(ratios, 0.0)
+    return np.asarray(np.sum(squares - squares / variances - np.log(variances), axis=1))
+
+
 def _fit_scatter(columns: Array, values: Array, base: Array) -> tuple[float, float]:
     """Return the standard deviation to add to each dwell so that chi-square is as expected, and chi-square before."""
     freedom = len(columns) - columns.shape[1]
@@ -300,10 +363,12 @@ def _find_root(excess: Callable[[float], float], high: float) -> float:
     return high
 
 
-def _fit_run_scatter(problem: RateProblem, order: int, variance: Array, gains: list[Array]) -> tuple[float, int | None]:
+def _fit_run_scatter(
+    problem: RateProblem, walks: list[Array], variance: Array, gains: list[Array]
+) -> tuple[float, int | None]:
     """Return the relative standard deviation of scale factors over runs of one axis, and its degrees of freedom.
 
-    All gyroscopes are pooled; 0 and None where the noise explains the scatter (chi-square).
+    All gyroscopes are pooled; 0 and None where noise and `walks`, shapes (n, n), explain the scatter (chi-square).
     """
     groups, mean = [], subtract_lean(problem, gains)
     for i, axis in enumerate(problem.gyros):
@@ -318,7 +383,8 @@ def _fit_run_scatter(problem: RateProblem, order: int, variance: Array, gains: l
             )  # fmt: skip
             columns = design(part, 0, 1)
             if len(columns) > columns.shape[1]:
-                estimate, matrix, _ = _fit_generalised(columns, part.mean[:, 0], np.diag(variance[which, i]))
+                covariance = np.diag(variance[which, i]) + walks[i][np.ix_(which, which)]
+                estimate, matrix, _ = _fit_generalised(columns, part.mean[:, 0], covariance)
                 by_run.append((estimate[0] / scale, matrix[0, 0] / scale**2))
         if len(by_run) > 1:
             groups.append(np.array(by_run))
@@ -493,11 +559,12 @@ class Linearity:
     drift: tuple[float, float] | None
 
 
-def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int) -> Linearity:
+def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int, walk: float) -> Linearity:
     """Return nonlinearity, asymmetry, hysteresis and threshold of gyroscope number `gyro`, and the residuals behind.
 
     ``r = M / S - w - zero of the run``, by weighted least squares of a line over the rates about its axis. Nonlinearity
-    is the largest absolute mean of r at one rate over the largest rate; its uncertainty is that of this mean.
+    is the largest absolute mean of r at one rate over the largest rate; its uncertainty is that of this mean. `walk` is
+    that of the gyroscope's zero, as in `RateSolution`.
     """
     on_axis = problem.axis == problem.gyros[gyro]
     rate, runs = problem.rate[on_axis], problem.run[on_axis]
@@ -533,7 +600,7 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int)
         steps, seen = (rate / largest, values / largest, variance / largest**2), (key, runs, problem.time[on_axis])
         bend = test_bend(*steps, of_rate / largest**2, *seen, order)
         if loop is not None:
-            loop, fitted_loop = fit_loop(*steps, *seen, direction) or (None, None)
+            loop, fitted_loop = fit_loop(*steps, *seen, direction, walk / (scale * largest) ** 2) or (None, None)
     return Linearity(
         rate=rate,
         residual=left / largest,
