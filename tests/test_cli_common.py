@@ -110,6 +110,7 @@ def test_only_what_is_near_is_suggested():
     assert meant(["+z", "-z"], "z") == ""
     assert meant(["+z", "-z"], "+Z") == "; did you mean '+z'?"
     assert meant(["huber", "square"], "median") == ""
+    assert meant(["growing"], "growing") == ""  # what is wrong is elsewhere, as in growing:x
     assert listed(iter(["auto", "0"]), 7) == "auto 0"
 
 

@@ -53,7 +53,7 @@ def meant(known: Iterable[str], word: object, alike: float = 0.6) -> str:
     names, text = {name.lower(): name for name in known}, str(word).lower()
     close = get_close_matches(text, names, n=2, cutoff=alike)
     tied = len(close) == 2 and len({SequenceMatcher(None, name, text).ratio() for name in close}) == 1
-    return f"; did you mean {names[close[0]]!r}?" if close and not tied else ""
+    return f"; did you mean {names[close[0]]!r}?" if close and not tied and names[close[0]] != word else ""
 
 
 def install(extra: str) -> str:
