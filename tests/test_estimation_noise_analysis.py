@@ -246,6 +246,15 @@ def test_a_step_that_is_taken_out_leaves_the_record_as_it_was():
     np.testing.assert_allclose(left.spectra[0].power, clean.spectra[0].power, rtol=1e-6)
 
 
+def test_a_long_log_is_read_in_a_band_below_that_of_its_stretches():
+    """1 kHz, filtered to 2 Hz: the spectrum of the stretches at the full rate begins at 4 Hz."""
+    x = lfilter(*butter(4, 2, fs=1000), samples(4_400_000, 1e-3, 6, white=0.1))
+    stretch = transformed(x, 1e-3)
+    found = analysed([stretch], ("N",))
+    assert [within(each, found.band.highest).freedom.any() for each in stretch.spectra] == [True, False]
+    assert found.choice.values[0, 0, NAMES.index("white")] == pytest.approx(0.1, rel=0.03)
+
+
 def test_the_band_ends_where_the_sensor_filters():
     x = samples(1_000_000, 0.005, 6, white=0.1, flicker=0.02)
     full = transformed(x, 0.005).spectra

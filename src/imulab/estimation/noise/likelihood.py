@@ -241,8 +241,9 @@ def time_limits(spectra: Sequence[Spectrum]) -> tuple[float, float]:
     A shorter one is white noise up to the highest frequency of the spectra, f_max; a longer one is a walk.
     """
     highest = [
-        float(each.last[np.flatnonzero(np.atleast_2d(each.freedom).any(axis=0))[-1]]) / (2 * each.length)
-        for each in spectra
+        float(each.last[counted[-1]]) / (2 * each.length)
+        for each in spectra  # those of the upper frequencies have none in a narrow band
+        if (counted := np.flatnonzero(np.atleast_2d(each.freedom).any(axis=0))).size
     ]
     return 2 / max(highest), max(each.length for each in spectra)
 
