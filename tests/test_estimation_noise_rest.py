@@ -244,6 +244,9 @@ def test_a_full_disk_is_said_in_one_line(tmp_path, monkeypatch, capsys):
     import io
 
     class Full(io.BytesIO):
+        def __init__(self, buffering):
+            super().__init__()
+
         def write(self, _):
             raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -651,13 +651,14 @@ def stored_as(values: Array, like: Array) -> Array:
 
 
 def _file() -> IO[bytes]:
-    return tempfile.TemporaryFile()
+    return tempfile.TemporaryFile(buffering=0)
 
 
 def _write(file: IO[bytes], values: Array, name: str) -> None:
     try:
-        file.write(np.ascontiguousarray(values, dtype=np.float64).data)
-        file.flush()
+        left = np.ascontiguousarray(values, dtype=np.float64).view(np.uint8).data
+        while left:
+            left = left[file.write(left) :]
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise

@@ -30,13 +30,13 @@ from imulab.readers.labelled import LabelledLines
 from imulab.readers.layout import BackwardsError, Readings
 from imulab.readers.opened import HEAD, opened, unit_row
 from imulab.readers.titles import fields_of, titles_of
-from imulab.recording import CORRECTED_BY, LARGE, Array, Layout, LayoutColumn, Recording
+from imulab.recording import CORRECTED_BY, Array, Layout, LayoutColumn, Recording
 from imulab.writers import powers_of_five
 
 # Lines of a file: one by one for the head, in whole blocks below.
 
 
-_BLOCK_BYTES = 1 << 21  # read at once; twice as much of a large file, for fewer blocks
+_BLOCK_BYTES = 1 << 21  # read at once
 WORTH_SHARING = 1 << 19  # bytes from which a block is shared among threads
 _MOST_THREADS = 8  # that parse one file
 LONGEST_LINE = 1 << 20  # bytes: a longer line without an end is no text
@@ -250,7 +250,7 @@ class Lines:
     def _next_bytes(self) -> bytes:
         while True:
             try:
-                data = self._read(_BLOCK_BYTES << (self.taken > LARGE))
+                data = self._read(_BLOCK_BYTES)
             except OSError as error:
                 raise ReadError(f"{self._name}: cannot be read: {error.strerror}") from None
             self._ended = not data
