@@ -203,9 +203,9 @@ class Lines:
     def first(self) -> bytes:
         """Return the first line that is neither blank nor a comment without consuming it; empty if there is none."""
         while True:
-            found = _OF_DATA.search(self._rest, self._at)
-            if self._ended or self.waiting > LONGEST_LINE or (found and found.end() < len(self._rest)):
-                return found[0] if found else b""
+            match = _OF_DATA.search(self._rest, self._at)
+            if self._ended or self.waiting > LONGEST_LINE or (match and match.end() < len(self._rest)):
+                return match[0] if match else b""
             self._read_more()
 
     def head(self, size: int) -> bytes:
