@@ -194,7 +194,10 @@ def browser(chromium: str) -> Iterator[Any]:
 
 @pytest.fixture
 def new_page(browser: Any) -> Iterator[Callable[[str], Any]]:
-    """A function that opens an address; at the end no page may have reported a fault, nor one of its policy."""
+    """A function that opens an address; at the end no page may have reported a fault, nor one of its policy.
+
+    A test waits for a function, `() => ...`: a mere expression is evaluated anew in the page, which its policy forbids.
+    """
     context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
     context.set_default_timeout(60_000)
     faults: list[str] = []

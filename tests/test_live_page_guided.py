@@ -234,7 +234,7 @@ def test_a_wrong_token_and_another_page_get_nothing(live, new_page, elsewhere):
     }""",
         base,
     )
-    hostile.wait_for_function("found.length === 3")
+    hostile.wait_for_function("() => found.length === 3")
     assert sorted(hostile.evaluate("found")) == ["no answer", "no script", "socket closed"]
 
 

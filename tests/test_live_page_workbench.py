@@ -210,7 +210,7 @@ def test_an_older_list_of_files_takes_no_file_off(workbench, new_page):
     held: list[Any] = []
     page.route("**/api/workbench/files", lambda route: held.append((route, route.fetch())))
     page.reload()
-    page.wait_for_function("document.querySelector('.drop')")
+    page.locator(".drop").wait_for()
     await_request(page, held)
     drop(page, "phone.csv", "t;a\n1;x\n")
     entry = page.locator("[data-name='imulab-files/phone.csv']")
@@ -556,7 +556,7 @@ def test_every_control_has_a_name_and_fits_the_screen(workbench, new_page):
     controls = page.locator("#workbench :is(input, select, button, a, svg.plot):visible")
     for width in (390, 768, 1280):
         page.set_viewport_size({"width": width, "height": 800})
-        page.wait_for_function("document.documentElement.scrollWidth <= innerWidth")  # once plots are drawn anew
+        page.wait_for_function("() => document.documentElement.scrollWidth <= innerWidth")  # once plots are drawn anew
         nameless = controls.evaluate_all(
             """all => all.filter(each =>
                 !(each.getAttribute("aria-label") || each.labels?.length || each.textContent.trim())
