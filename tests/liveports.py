@@ -7,6 +7,7 @@ import os
 import select
 import subprocess
 import sys
+import termios
 import threading
 import time
 import tty
@@ -20,7 +21,7 @@ import imulab as il
 
 
 class Device:
-    """Sends pieces at a pace from a thread; where nobody reads, those that are late by a second are lost.
+    """Sends pieces at a pace from a thread, once somebody listens; then those that are late by a second are lost.
 
     Parameters
     ----------
@@ -37,6 +38,7 @@ class Device:
         tty.setraw(self._kept_open)
         os.set_blocking(self.end, False)
         self.port = os.ttyname(self._kept_open)
+        self._speed = termios.tcgetattr(self._kept_open)[4]
         self.sent: list[tuple[int, float]] = []
         self.done = threading.Event()
         self._pieces, self._rate, self._patient = pieces, rate, patient
@@ -49,7 +51,13 @@ class Device:
         """Send; a patient one waits until it is told that somebody listens, since opening a port empties it."""
         self._thread.start()
 
+    def await_listener(self) -> None:
+        """Wait until somebody has opened the port, who sets its speed."""
+        while termios.tcgetattr(self._kept_open)[4] == self._speed and not self._stop.is_set():
+            time.sleep(0.01)
+
     def _run(self) -> None:
+        self.await_listener()
         number, begun = 0, time.monotonic()
         while number < len(self._pieces) and not self._stop.is_set():
             due = begun + number / self._rate
@@ -144,7 +152,7 @@ class Process:
     def text(self) -> str:
         return "\n".join(line for _, line in self.lines)
 
-    def said(self, what: str, seconds: float = 20.0) -> float:
+    def said(self, what: str, seconds: float = 180.0) -> float:
         """Wait until it has said something, and return when; infinite if it never does."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -172,7 +180,7 @@ class Process:
         self._process.kill()
         self.ended()
 
-    def ended(self, seconds: float = 20.0) -> int:
+    def ended(self, seconds: float = 180.0) -> int:
         """Return the exit status; a process that does not end is killed, and the test fails."""
         try:
             status = self._process.wait(seconds)

@@ -152,7 +152,7 @@ def terminal() -> Iterator[tuple[int, str]]:
                 os.close(each)
 
 
-def wait_for(what: Callable[[], bool], seconds: float = 5.0) -> bool:
+def wait_for(what: Callable[[], bool], seconds: float = 60.0) -> bool:
     end = time.monotonic() + seconds
     while not what():
         if time.monotonic() > end:

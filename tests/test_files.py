@@ -4,7 +4,7 @@ import os
 import stat
 import subprocess
 import sys
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 import pytest
@@ -208,10 +208,10 @@ def test_contents_that_are_refused_at_once(tmp_path, case):
     content, message = CONTENTS[case]
     path = tmp_path / "board.toml"
     path.write_bytes(content)
-    began = perf_counter()
+    began = process_time()
     with pytest.raises(ReadError) as caught:
         load_toml(path, "board.toml", "layout")
-    assert perf_counter() - began < 1
+    assert process_time() - began < 1
     assert str(caught.value).startswith("board.toml: ")
     assert message in str(caught.value)
 

@@ -272,17 +272,19 @@ def test_after_half_a_minute_a_record_is_made_of_what_there_is(lines, tmp_path):
             (tmp_path / str(enough)).mkdir()
             started = live([f"serial:{unit.port}", *words], tmp_path / str(enough))
             processes[enough] = sessions.enter_context(started)
-        time.sleep(3.0)  # until somebody listens, since opening a port empties it
+        for unit in units.values():
+            unit.await_listener()
+        time.sleep(0.5)  # opening a port empties it
         for unit in units.values():
             unit.begin()
         lost = {}
         for count in (3, 10):
-            assert processes[count].said(f"attitude {count} accepted", 60) < float("inf"), processes[count].text
+            assert processes[count].said(f"attitude {count} accepted") < float("inf"), processes[count].text
             units[count].unplug()
             lost[count] = processes[count].said("reconnecting")
         for count in (3, 10):
-            assert processes[count].ended(45) == (0 if count == 10 else 2), processes[count].text
-            assert 28 < time.monotonic() - lost[count] < 40
+            assert processes[count].ended() == (0 if count == 10 else 2), processes[count].text
+            assert 28 < time.monotonic() - lost[count] < 70
             units[count].close()
             assert "for 30 s: the session ends with what there is" in processes[count].text
             assert (tmp_path / str(count) / "rec.json").exists() == (count == 10)

@@ -211,7 +211,7 @@ def test_another_page_is_refused_though_it_has_the_token(running, headers, statu
 def test_the_socket_is_behind_the_same_guard(running):
     for headers in ({"X-Imulab-Token": "wrong"}, {"Origin": "http://evil.example"}):
         with pytest.raises((InvalidStatus, ConnectionClosed)), running.socket(**headers) as page:
-            page.recv(timeout=5)
+            page.recv(timeout=60)
 
 
 def test_static_files_come_with_their_kind_and_from_their_folder_alone(running):
@@ -237,12 +237,12 @@ def test_no_script_of_the_page_looks_behind_which_older_safaris_do_not_read():
 def test_messages_reach_the_part_and_every_page(running):
     with running.socket() as one, running.socket(Origin=f"http://{running.host}") as other:
         for page in (one, other):
-            assert json.loads(page.recv(timeout=5)) == {
+            assert json.loads(page.recv(timeout=60)) == {
                 "type": "hello", "areas": ["workbench"], "version": server.VERSION,
             }  # fmt: skip
-            assert json.loads(page.recv(timeout=5)) == {"type": "welcome"}
+            assert json.loads(page.recv(timeout=60)) == {"type": "welcome"}
         one.send('{"type": "say", "text": "<b>µ</b>"}')
-        assert [json.loads(page.recv(timeout=5))["text"] for page in (one, other)] == ["<b>µ</b>"] * 2
+        assert [json.loads(page.recv(timeout=60))["text"] for page in (one, other)] == ["<b>µ</b>"] * 2
 
 
 @pytest.mark.parametrize(
@@ -258,13 +258,13 @@ def test_messages_reach_the_part_and_every_page(running):
 )
 def test_a_message_that_cannot_be_done_is_answered_by_a_sentence(running, text, said):
     with running.socket() as page:
-        page.recv(timeout=5), page.recv(timeout=5)
+        page.recv(timeout=60), page.recv(timeout=60)
         page.send(text)
-        answer = json.loads(page.recv(timeout=5))
+        answer = json.loads(page.recv(timeout=60))
         assert answer["type"] == "refused"
         assert said in answer["text"]
         page.send('{"type": "say", "text": "still there"}')
-        assert json.loads(page.recv(timeout=5))["text"] == "still there"
+        assert json.loads(page.recv(timeout=60))["text"] == "still there"
 
 
 def test_an_upload_lands_in_the_folder_within_the_limit(running, tmp_path):
@@ -307,7 +307,7 @@ def test_numbers_that_are_none_are_null():
 def test_a_page_for_others_tells_an_address_that_they_reach():
     listening = server._listen(0, "0.0.0.0")
     address = server._address_for_others("0.0.0.0"), listening.getsockname()[1]
-    with socket.create_connection(address, timeout=5):
+    with socket.create_connection(address, timeout=60):
         pass
     listening.close()
     assert server._address_for_others("10.1.2.3") == "10.1.2.3"
@@ -323,7 +323,7 @@ def test_a_page_listens_at_addresses_of_version_six(host):
         pytest.skip("this machine has no IPv6")
     address = server._address_for_others(host)
     assert address[0] + address[-1] == "[]"
-    with socket.create_connection((address[1:-1], listening.getsockname()[1]), timeout=5):
+    with socket.create_connection((address[1:-1], listening.getsockname()[1]), timeout=60):
         pass
     listening.close()
 
@@ -343,7 +343,7 @@ def test_half_requests_are_closed_and_whole_ones_are_not(running, monkeypatch):
     begun = f"GET / HTTP/1.1\r\nHost: {running.host}\r\n"
     body = f"PUT /api/files/half HTTP/1.1\r\nHost: {running.host}\r\nX-Imulab-Token: {running.token}\r\n"
     halves = ["", "GET", begun, f"{begun}\r\n{begun}", f"{body}Content-Length: 100\r\n\r\nsome"]
-    links = [socket.create_connection((host, int(port)), timeout=5) for _ in halves]
+    links = [socket.create_connection((host, int(port)), timeout=60) for _ in halves]
     with running.socket() as page:  # a page that says nothing stays
         for link, half in zip(links, halves, strict=True):
             link.sendall(half.encode())
@@ -352,7 +352,7 @@ def test_half_requests_are_closed_and_whole_ones_are_not(running, monkeypatch):
                 pass
             link.close()
         page.send('{"type": "say", "text": "still here"}')
-        while "still here" not in page.recv(timeout=5):
+        while "still here" not in page.recv(timeout=60):
             pass
     assert running.ask("/", **running.key).status == 200
     assert not (running.part.folder / "half").exists()

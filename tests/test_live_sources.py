@@ -125,7 +125,8 @@ def test_replay_keeps_the_pace(tmp_path):
     begun = time.monotonic()
     while not source.ended:
         source.get(0.05)
-    assert time.monotonic() - begun == pytest.approx(recording.time[-1] / 20, abs=0.3)
+    due = recording.time[-1] / 20
+    assert due - 0.1 < time.monotonic() - begun < due + 10  # a busy machine is late, and never early
 
 
 def test_a_simulated_unit_goes_where_it_is_told():
@@ -237,8 +238,11 @@ def test_what_waits_is_bounded_and_a_sender_waits_or_its_losses_are_counted(held
 
     source = Linked(LinkKind("flood", lambda: Link(read), held_back=held_back))
     assert wait_for(lambda: sent >= 21)
-    time.sleep(0.1)
-    assert (sent == 21) == held_back  # one more than fits is read, and waits
+    if held_back:
+        time.sleep(0.1)
+        assert sent == 21  # one more than fits is read, and waits
+    else:
+        assert wait_for(lambda: sent > 21)
     got = b""
     while not source.ended:
         got += b"".join(piece.data for piece in source.get(0.05))

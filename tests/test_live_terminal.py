@@ -106,7 +106,7 @@ class Screen:
         )  # fmt: skip
         os.close(inner)
 
-    def until(self, what: str, seconds: float = 25.0) -> bool:
+    def until(self, what: str, seconds: float = 180.0) -> bool:
         end = time.monotonic() + seconds
         while what not in self.text and time.monotonic() < end:
             if select.select([self.end], [], [], 0.1)[0]:
@@ -116,7 +116,7 @@ class Screen:
                     break
         return what in self.text
 
-    def shows(self, what: str, seconds: float = 25.0) -> bool:
+    def shows(self, what: str, seconds: float = 180.0) -> bool:
         """Whether a text comes, whatever its style."""
         end = time.monotonic() + seconds
         while what not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text) and time.monotonic() < end:
@@ -127,7 +127,7 @@ class Screen:
         self.text = ""
         os.write(self.end, key.encode())
 
-    def ended(self, seconds: float = 15.0) -> int:
+    def ended(self, seconds: float = 180.0) -> int:
         end = time.monotonic() + seconds
         while self.process.poll() is None and time.monotonic() < end:
             self.until("\0", 0.1)  # what nobody reads would hold the process up

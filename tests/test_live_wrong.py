@@ -155,13 +155,13 @@ def test_every_sample_of_a_network_source_is_saved(kind, tmp_path):
                     send(lambda line: (process.stdin.write(line.decode()), process.stdin.flush()))
             except (BrokenPipeError, ConnectionError):
                 pass  # it was enough
-            assert process.ended(20) in (0, 2), process.text
+            assert process.ended() in (0, 2), process.text
     same_as_sent(tmp_path, recording)
 
 
 def listening(port: int) -> bool:
     """Wait until somebody is bound to the port of datagrams."""
-    end = time.monotonic() + 15
+    end = time.monotonic() + 60
     while time.monotonic() < end:
         if any(line.split()[1].endswith(f":{port:04X}") for line in Path("/proc/net/udp").read_text().splitlines()[1:]):
             return True
@@ -171,7 +171,7 @@ def listening(port: int) -> bool:
 
 def test_a_wrong_baud_rate_is_said_and_leaves_no_file(tmp_path):
     with device([NOISE] * 3000, 500) as unit, live([f"serial:{unit.port}@9600", *WORDS], tmp_path) as process:
-        assert process.ended(20) == 2
+        assert process.ended() == 2
     assert len(process.lines) == 1
     assert "the baud rate is probably another: try @9600 @57600" in process.text
     assert not (tmp_path / "rec.csv").exists()
@@ -180,7 +180,7 @@ def test_a_wrong_baud_rate_is_said_and_leaves_no_file(tmp_path):
 def test_an_unknown_format_shows_its_lines_and_offers_a_layout(tmp_path):
     lines = [f"{10 * k} 0.01 -0.02 {0.99 + 0.001 * (k % 3)}\n".encode() for k in range(3000)]
     with device(lines, 400) as unit, live([f"serial:{unit.port}", *WORDS], tmp_path) as process:
-        assert process.ended(20) == 2
+        assert process.ended() == 2
     assert process.lines[-1][1].startswith(f"imulab: serial:{unit.port}@115200: unknown format: ")
     assert 'accel_z = { from = 3, unit = "g" }' in process.text
     assert "save it as layout.toml, and add --layout layout.toml" in process.text
@@ -193,10 +193,10 @@ def test_a_stream_that_stops_is_said_and_what_came_is_kept(tmp_path):
     with device(lines_of(recording)[:3200], 800) as unit:
         words = [f"serial:{unit.port}", "--plain", "--save", "rec.csv"]
         with live(words, tmp_path) as process:
-            assert process.said(f"nothing has come from serial:{unit.port}@115200 for 3 s", 25) < float("inf")
+            assert process.said(f"nothing has come from serial:{unit.port}@115200 for 3 s") < float("inf")
             assert process.running
             process.send(signal.SIGINT)
-            assert process.ended(5.0) == 130
+            assert process.ended() == 130
     assert "rec.csv keeps" in process.lines[-1][1]
     same_as_sent(tmp_path, recording, unit)
 
@@ -212,7 +212,7 @@ def test_a_full_disk_is_one_sentence_and_keeps_whole_lines(tmp_path):
     with device(lines_of(recording), 800) as unit:
         words = [f"serial:{unit.port}", "--plain", "--save", "rec.csv"]
         with live(words, tmp_path, preexec_fn=fill) as process:
-            assert process.ended(20) == 2
+            assert process.ended() == 2
     assert process.lines[-1][1].startswith("imulab: rec.csv: cannot be written on: ")
     assert process.lines[-1][1].endswith("what came before is kept, and --resume goes on with it")
     assert (tmp_path / "rec.csv").stat().st_size <= limit
