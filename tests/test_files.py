@@ -11,7 +11,7 @@ import pytest
 
 from imulab.cli import main
 from imulab.errors import OptionError, ReadError
-from imulab.files import load_toml, write_text
+from imulab.files import load_toml, replacing, write_text
 from imulab.fleet.manifest import local_file
 from imulab.fleet.store import Store
 from imulab.readers import load_layout, read
@@ -322,3 +322,23 @@ def test_a_full_disk_is_told_with_the_file_of_the_fleet(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_an_interrupt_while_a_file_is_opened_leaves_nothing(tmp_path, monkeypatch):
+    opened = os.open
+
+    def interrupted(*words, **more):
+        opened(*words, **more)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", interrupted)
+        with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "out.csv"):
+            pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "a.csv").touch()
+    with pytest.raises(OptionError, match="cannot be written: Not a directory"):
+        write_text(tmp_path / "a.csv" / "out.csv", "x")

@@ -6,10 +6,9 @@ import math
 import os
 import re
 import stat
-import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BufferedReader
 from os import PathLike
@@ -61,24 +60,24 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
         except OSError as error:
             raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
         return
+    part = target.with_name(f".imulab.{os.urandom(8).hex()}.part")  # known before it is there: no signal leaves it
     try:
-        descriptor, name = tempfile.mkstemp(prefix=".imulab.", suffix=".part", dir=target.parent)
-    except OSError as error:
-        raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
-    part = Path(name)
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
+        with open(part, "xb", opener=_open_for_me) as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
         part.chmod(_mode(target))
         part.replace(target)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
-    except BaseException:
-        part.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            part.unlink()
+        if isinstance(error, OSError):
+            raise OptionError(f"{path}: cannot be written: {error.strerror}") from None
         raise
+
+
+def _open_for_me(name: str, flags: int) -> int:
+    return os.open(name, flags, 0o600)
 
 
 def _mode(target: Path) -> int:
