@@ -1,8 +1,11 @@
 """Files to recordings: native CSV, foreign text through layouts, and the parser of numbers."""
 
+import gc
 import hashlib
 import io
 import sys
+import threading
+import time
 from decimal import Decimal
 from pathlib import Path
 
@@ -15,7 +18,7 @@ from hypothesis import strategies as st
 import imulab as il
 from imulab import readers
 from imulab.errors import ReadError, UnitError
-from imulab.readers import Layout, _text, load_layout, read, read_blocks
+from imulab.readers import Layout, _text, load_layout, read, read_blocks, text
 from imulab.recording import LayoutColumn
 
 FIXED = settings(derandomize=True, database=None, deadline=None, max_examples=150)
@@ -526,3 +529,76 @@ def test_blocks_that_are_joined_as_they_are_read_make_the_same_recording(tmp_pat
         "gyro_x": True,
     }
     assert (found.units["gyro_x"], found.metadata["serial"], found.first_row) == ("deg/s", "7", 1)
+
+
+# --- the hash of a large file, in a thread of its own ------------------------------------------------------------
+
+
+class SlowHash:
+    """A hash that takes longer than reading, and counts blocks; `broken`: the one at which it raises an error."""
+
+    def __init__(self, broken: int | None = None):
+        self.blocks, self.broken, self.sum = 0, broken, hashlib.sha256()
+
+    def update(self, data):
+        time.sleep(0.01)
+        if self.blocks == self.broken:
+            raise MemoryError("no room for the hash")
+        self.sum.update(data)
+        self.blocks += 1
+
+    def hexdigest(self):
+        return self.sum.hexdigest()
+
+
+@pytest.fixture
+def slow_hash(monkeypatch):
+    def install(broken: int | None = None) -> SlowHash:
+        slow = SlowHash(broken)
+        monkeypatch.setattr(text.hashlib, "sha256", lambda: slow)
+        return slow
+
+    return install
+
+
+def test_few_blocks_wait_for_a_slow_hash(slow_hash):
+    slow, blocks = slow_hash(), [bytes([k]) * text.WORTH_SHARING for k in range(30)]
+    digest, most = text.Hash(), 0
+    for number, block in enumerate(blocks, start=1):
+        digest.update(block)
+        most = max(most, number - slow.blocks)
+    digest.stop()
+    assert 2 <= most <= 6
+    assert digest.hexdigest() == hashlib.new("sha256", b"".join(blocks)).hexdigest()
+
+
+def threads_end(before: int) -> bool:
+    deadline = time.monotonic() + 10
+    while threading.active_count() > before and time.monotonic() < deadline:
+        gc.collect()
+        time.sleep(0.01)
+    return threading.active_count() <= before
+
+
+LARGE_FILE = b"accel_x [m/s^2],temperature [degC]\n" + b"1.23456789,20\n" * 1_500_000  # ten blocks
+
+
+@pytest.mark.parametrize("broken", [0, 2, 9])
+def test_an_error_of_the_hash_ends_reading(file, slow_hash, broken):
+    before = threading.active_count()
+    slow_hash(broken)
+    with pytest.raises(MemoryError, match="no room for the hash"):
+        read(file(LARGE_FILE))
+    assert threads_end(before)
+
+
+def test_an_error_of_a_row_or_an_early_end_of_reading_leaves_no_thread_behind(file, slow_hash):
+    before = threading.active_count()
+    slow_hash()
+    with pytest.raises(ReadError, match="expected a number, found 'bad'"):
+        read(file(LARGE_FILE[:14_000_035] + b"bad,20\n" + LARGE_FILE[14_000_035:]))
+    assert threads_end(before)
+    blocks = read_blocks(file(LARGE_FILE))
+    assert len(next(blocks)) > 0
+    del blocks
+    assert threads_end(before)

@@ -13,7 +13,7 @@ import stat
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import BinaryIO
@@ -39,6 +39,7 @@ from imulab.writers import powers_of_five
 _BLOCK_BYTES = 1 << 21  # read at once
 WORTH_SHARING = 1 << 19  # bytes from which a block is shared among threads
 _MOST_THREADS = 8  # that parse one file
+_MOST_WAITING = 4  # blocks that are read and not yet hashed
 LONGEST_LINE = 1 << 20  # bytes: a longer line without an end is no text
 _OF_DATA = re.compile(rb"^(?!#)[^\n]*\S[^\n]*", re.M)  # a line that is neither blank nor a comment
 
@@ -70,24 +71,29 @@ class ParserThreads:
 
 
 class Hash:
-    """SHA-256 of the bytes read, computed in its own thread for large files."""
+    """SHA-256 of the bytes read, computed in its own thread for large files; its errors are raised here."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
         self._pool: ThreadPoolExecutor | None = None
+        self._waiting: deque[Future[None]] = deque()
 
     def update(self, data: bytes) -> None:
-        """Add these bytes."""
+        """Add these bytes; wait first where several blocks are not yet hashed, so that they do not fill the memory."""
         if self._pool is None and len(data) < WORTH_SHARING:
             self._hash.update(data)
             return
         self._pool = self._pool or ThreadPoolExecutor(1)
-        self._pool.submit(self._hash.update, data)
+        if len(self._waiting) == _MOST_WAITING:
+            self._waiting.popleft().result()
+        self._waiting.append(self._pool.submit(self._hash.update, data))
 
     def stop(self) -> None:
         """Wait until all bytes are in."""
         if self._pool is not None:
             self._pool.shutdown()
+        while self._waiting:
+            self._waiting.popleft().result()
 
     def hexdigest(self) -> str:
         """Return the hash, hexadecimal."""
