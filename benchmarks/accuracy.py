@@ -16,7 +16,7 @@ import imulab as il
 from imulab.procedures.centrifuge.manifest import Manifest, Run
 from imulab.procedures.centrifuge.simulate import Simulation, Truth, typical_truth
 from imulab.procedures.gyro_array.elements import find_elements
-from imulab.procedures.gyro_array.fuse import FuseOptions, open_stream
+from imulab.procedures.gyro_array.stream import FuseOptions, open_stream
 from imulab.procedures.tumble.gyro.fit import fit_gyro_triad
 from imulab.procedures.tumble.plan import plan_attitudes
 from imulab.procedures.views import compare_records

@@ -16,7 +16,8 @@ from timing import measured, seconds
 
 import imulab as il
 from imulab.device.unit import array_stream
-from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
+from imulab.procedures.gyro_array.fuse import fuse
+from imulab.procedures.gyro_array.stream import FuseOptions
 from imulab.recording import Recording
 
 _BARE = r"""

@@ -15,8 +15,9 @@ from imulab.device.tables import Fusion
 from imulab.display import Note
 from imulab.procedures.gyro_array.compare import compare_methods, run_experiment
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse
+from imulab.procedures.gyro_array.fuse import Fuser, fuse
 from imulab.procedures.gyro_array.simulate import Fault, simulate_array
+from imulab.procedures.gyro_array.stream import FuseOptions
 from imulab.procedures.views import exhibits_of
 from test_gyro_array_fuse import array_recording, dynamic
 
@@ -245,23 +246,22 @@ def test_compare_finds_errors_reduction_and_limit():
 
 
 def test_compare_measures_bandwidth_and_warns_of_filtering(monkeypatch):
-    from imulab.procedures.gyro_array import fuse as fuse_module
-    from imulab.procedures.gyro_array import fuse as kalman
+    from imulab.procedures.gyro_array import stream
 
     recording = simulate_array(experiment="static", duration=200.0, seed=2)
     found = compare_methods(recording)
     assert found.figures["mean"][0].bandwidth == 50.0
     assert not any("mean:" in message for message in found.warnings)
     slow = np.radians(0.05)  # process noise of a unit that hardly moves
-    monkeypatch.setattr(kalman, "RATE_WALK", slow)
-    real = fuse_module.steady_gain
+    monkeypatch.setattr(stream, "RATE_WALK", slow)
+    real = stream.steady_gain
     gains = []
 
     def narrow(white, walk, rate_walk, step):
         gains.append(real(white, walk, np.degrees(slow), step))
         return gains[-1]
 
-    monkeypatch.setattr(fuse_module, "steady_gain", narrow)
+    monkeypatch.setattr(stream, "steady_gain", narrow)
     filtered = compare_methods(recording)
     gain = gains[0][0].sum()
     # A first-order recursive filter with gain K has its -3 dB point where |K / (1 - (1 - K) e^-jw)|^2 = 1/2.

@@ -8,7 +8,8 @@ from imulab.errors import DataError
 from imulab.procedures.gyro_array.compare import compare_methods
 from imulab.procedures.gyro_array.elements import Checks, common_motion, find_rest
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
+from imulab.procedures.gyro_array.fuse import fuse
+from imulab.procedures.gyro_array.stream import FuseOptions
 from imulab.recording import Recording
 from test_gyro_array_fit import UPSIDE_DOWN, motion
 from test_gyro_array_fuse import array_recording as recording_of

@@ -11,8 +11,9 @@ from imulab.errors import DataError, ObservabilityError, RecordError, UnitError
 from imulab.procedures.gyro_array import elements, fit
 from imulab.procedures.gyro_array.alignment import align, nominal_orientation
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse
+from imulab.procedures.gyro_array.fuse import Fuser, fuse
 from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
+from imulab.procedures.gyro_array.stream import FuseOptions
 from imulab.procedures.views import exhibits_of
 from imulab.recording import Recording
 from reference.moving_array import columns, moving_array

@@ -16,8 +16,9 @@ from imulab.device.unit import Blob, Stream, array_stream, make_blob
 from imulab.procedures.apply import tables_of
 from imulab.procedures.gyro_array.elements import find_elements
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, fuse, open_stream, parse_memory
+from imulab.procedures.gyro_array.fuse import Fuser, fuse
 from imulab.procedures.gyro_array.simulate import Fault, simulate_array
+from imulab.procedures.gyro_array.stream import FuseOptions, open_stream, parse_memory
 from imulab.recording import Recording
 from reference import gyro_array as reference
 
@@ -172,7 +173,7 @@ def test_robust_comes_within_2_percent_of_the_best_fixed_weights(seed):
 
 
 def test_the_gain_of_kalman_is_that_of_an_iterated_riccati_equation():
-    from imulab.procedures.gyro_array.fuse import steady_gain
+    from imulab.procedures.gyro_array.stream import steady_gain
 
     white, walk, rate_walk, dt = np.array([0.04, 0.06, 0.08]), np.array([1e-3, 2e-3, 1e-3]), 0.3, 0.02
     gain = steady_gain(white, walk, rate_walk, dt)

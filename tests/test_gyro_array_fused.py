@@ -12,7 +12,8 @@ import pytest
 from conftest import some_of
 from imulab.device.unit import array_stream
 from imulab.procedures.gyro_array.elements import EXCLUDED, HELD, JUMPED, NON_FINITE, STUCK, find_elements
-from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, open_stream
+from imulab.procedures.gyro_array.fuse import Fused, fuse
+from imulab.procedures.gyro_array.stream import FuseOptions, open_stream
 from test_gyro_array_fuse import array_recording, dynamic
 
 SEEDS = some_of(2, (1, 2, 3, 4))

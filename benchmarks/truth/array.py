@@ -120,7 +120,8 @@ def _said(seed: int, *, what: str, command: str, kind: str = "", fault: str = ""
     from imulab.errors import ImulabError
     from imulab.procedures.gyro_array.compare import compare_methods
     from imulab.procedures.gyro_array.fit import calibrate_array
-    from imulab.procedures.gyro_array.fuse import FuseOptions, fuse
+    from imulab.procedures.gyro_array.fuse import fuse
+    from imulab.procedures.gyro_array.stream import FuseOptions
 
     rng = np.random.default_rng([seed, 13])
     axes, n, count = (3 if kind == "swapped" else 1), 6, 4000

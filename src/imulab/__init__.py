@@ -45,7 +45,6 @@ if TYPE_CHECKING:
     from imulab.procedures.exporting import export as export
     from imulab.procedures.gyro_array.fit import ArrayFit as ArrayFit
     from imulab.procedures.gyro_array.fuse import Fused as Fused
-    from imulab.procedures.gyro_array.fuse import FuseOptions as FuseOptions
     from imulab.procedures.gyro_array.imus.compare import BoardComparison as BoardComparison
     from imulab.procedures.gyro_array.imus.compare import ImuDifference as ImuDifference
     from imulab.procedures.gyro_array.imus.compare import compare_imus as compare_imus
@@ -60,6 +59,7 @@ if TYPE_CHECKING:
     from imulab.procedures.gyro_array.public import fuse as fuse
     from imulab.procedures.gyro_array.public import merge_array as merge_array
     from imulab.procedures.gyro_array.simulate import simulate_array as simulate_array
+    from imulab.procedures.gyro_array.stream import FuseOptions as FuseOptions
     from imulab.procedures.magnetometer.check import check_magnetometer as check_magnetometer
     from imulab.procedures.magnetometer.fit import MagnetometerFit as MagnetometerFit
     from imulab.procedures.magnetometer.fit import fit_magnetometer as fit_magnetometer
@@ -115,7 +115,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "ArrayFit": "procedures.gyro_array.fit",
-    "FuseOptions": "procedures.gyro_array.fuse",
+    "FuseOptions": "procedures.gyro_array.stream",
     "Fused": "procedures.gyro_array.fuse",
     "ImusFit": "procedures.gyro_array.imus.fit",
     "allan_deviation": "procedures.noise.allan",

@@ -240,7 +240,8 @@ def fuse(file: RecordingFile, *, imus: WholeImus = False, output: OutputFile = N
     CSV or Parquet to OUT, CSV to standard output; - fuses each line as it comes.
     """
     from imulab.estimation.sampling import mend_blocks
-    from imulab.procedures.gyro_array.fuse import FuseOptions, Fuser, carried, fusion_text
+    from imulab.procedures.gyro_array.fuse import Fuser
+    from imulab.procedures.gyro_array.stream import FuseOptions, carried, fusion_text
     from imulab.quantities import interval
     from imulab.readers import is_pipe, read_blocks
     from imulab.readers.streams import on_clock_of
@@ -402,7 +403,7 @@ def compare(
         return
     from imulab.cli.show import verdict_lines
     from imulab.procedures.gyro_array.compare import compare_methods
-    from imulab.procedures.gyro_array.fuse import carried, fusion_text
+    from imulab.procedures.gyro_array.stream import carried, fusion_text
     from imulab.readers import read
     from imulab.readers.streams import one_clock
 

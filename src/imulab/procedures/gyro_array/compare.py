@@ -35,9 +35,10 @@ from imulab.procedures.gyro_array.elements import (
 )
 from imulab.procedures.gyro_array.figures import comparison_exhibits
 from imulab.procedures.gyro_array.fit import calibrate_array
-from imulab.procedures.gyro_array.fuse import Fused, FuseOptions, fuse, memory_text, open_stream, warn_misaligned
+from imulab.procedures.gyro_array.fuse import Fused, fuse, warn_misaligned
 from imulab.procedures.gyro_array.schema import MethodRow
 from imulab.procedures.gyro_array.simulate import NoiseModel, simulate_array
+from imulab.procedures.gyro_array.stream import FuseOptions, memory_text, open_stream
 from imulab.procedures.result import Drawn
 from imulab.recording import Array, Recording
 from imulab.records.calibration import Calibration, Covariance, warn_other_unit

@@ -59,7 +59,7 @@ def _function() -> Callable[..., ArrayFit]:
 
 
 def _values(texts: Mapping[str, str], label: str) -> dict[str, Any]:
-    from imulab.procedures.gyro_array.fuse import fusion_text
+    from imulab.procedures.gyro_array.stream import fusion_text
 
     values = read_options(TASK.options, texts, label)
     if values["interval"] is not None and values["window"]:
@@ -157,7 +157,7 @@ class GyroArrayProcedure(Procedure):
             from imulab.procedures.gyro_array.imus.device import fusion_of_board
 
             return fusion_of_board(record, stated)
-        from imulab.procedures.gyro_array.fuse import fusion_of_record
+        from imulab.procedures.gyro_array.stream import fusion_of_record
 
         return fusion_of_record(record, stated)
 

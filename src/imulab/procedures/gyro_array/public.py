@@ -16,9 +16,10 @@ from imulab.options import PROGRAM, READING, file, measure, parsed, text
 from imulab.procedures.gyro_array import compare, fit
 from imulab.procedures.gyro_array.compare import Comparison
 from imulab.procedures.gyro_array.fit import ArrayFit
-from imulab.procedures.gyro_array.fuse import RATE_WALK, Fused, FuseOptions, carried, fusion_text
+from imulab.procedures.gyro_array.fuse import Fused
 from imulab.procedures.gyro_array.fuse import fuse as fuse_recording
 from imulab.procedures.gyro_array.merge import Merged, merge_recordings
+from imulab.procedures.gyro_array.stream import RATE_WALK, FuseOptions, carried, fusion_text
 from imulab.procedures.result import Record, as_record, as_recording, check_keywords
 from imulab.quantities import in_si, interval, span
 from imulab.recording import Data, Part, Reading, Recording, Window
