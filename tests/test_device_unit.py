@@ -148,6 +148,7 @@ def test_states_that_cannot_be_are_refused():
         ({"rate": 0.0}, "rate 0.0: expected more than 0 Hz"),
         ({"rate": np.inf}, "rate inf"),
         ({"initial_bias": "last"}, "initial bias 'last': expected first, zero or biases"),
+        ({"initial_bias": "frist"}, "zero or biases; did you mean 'first'?"),
         ({"initial_bias": [1.0, 2.0]}, "initial bias: expected shape"),
         ({"bias": [np.nan] * 6}, "bias: expected finite numbers"),
         ({"weights": [1.0] * 5}, "weights: expected shape"),

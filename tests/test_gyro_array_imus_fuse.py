@@ -290,6 +290,7 @@ def test_what_cannot_be_fused_is_refused_by_name(board, record, tmp_path, capsys
         ("imu:5", "expected an IMU from 1 to 4"),
         ("imu:0", "expected an IMU from 1 to 4"),
         ("here", "expected centroid, imu:N, or x,y,z in m"),
+        ("centriod", "did you mean 'centroid'?"),
         ("1,2", "expected centroid, imu:N, or x,y,z in m"),
         ("1,2,nan", "expected centroid, imu:N, or x,y,z in m"),
     ],

@@ -228,6 +228,7 @@ def test_a_coefficient_is_null_with_a_reason_in_json(imulab, tmp_path):
         (np.array([0.0, np.nan, 1.0, 2.0]), 1.0, "octave", DataError, "finite"),
         (np.zeros(10), 0.0, "octave", OptionError, "sampling rate 0"),
         (np.zeros(10), 1.0, "decade", OptionError, "expected octave or dense"),
+        (np.zeros(10), 1.0, "octve", OptionError, "octave or dense; did you mean 'octave'?"),
         (np.zeros(10), 1.0, np.array([99.0]), OptionError, "expected averaging times from 1 s to 4 s"),
     ],
 )

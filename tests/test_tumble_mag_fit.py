@@ -276,6 +276,8 @@ def test_what_a_person_can_get_wrong_is_said_in_one_line():
     assert "1 to 24" in refuse(fine, same_direction=["9-36"])
     assert "loss 'none'" in refuse(fine, loss="none")
     assert "expected one of" in refuse(fine, mag_order=3)
+    assert "mag_order 'auot': expected one of 1 2 auto; did you mean 'auto'?" in refuse(fine, mag_order="auot")
+    assert "order 'auot': expected auto or 1 to 5; did you mean 'auto'?" in refuse(fine, order="auot")
     steep = simulated(8, dip=np.radians(88.5))[2]
     assert "vertical" in refuse(table(*steep))
 
@@ -707,6 +709,7 @@ def test_a_dip_of_another_place_is_refused():
         ({"dip": "67", "latitude": "-47 deg"}, "dip of the northern hemisphere, latitude of the southern"),
         ({"latitude": "47 deg", "hemisphere": "south"}, "latitude of the northern hemisphere, hemisphere of the south"),
         ({"hemisphere": "up"}, "expected north or south"),
+        ({"hemisphere": "nroth"}, "north or south; did you mean 'north'?"),
     ],
 )
 def test_what_cannot_be_is_refused_before_there_is_data(stated, said):

@@ -376,6 +376,10 @@ def test_true_headings_are_magnetic_ones_turned_by_the_declination_of_the_place(
     assert main(["apply", "--heading", "r.json", "r.csv", "-o", "o.csv"]) == 0
     assert main(["apply", "--heading=up", "r.json", "r.csv", "-o", "o.csv"]) == 2
     assert "--heading 'up': expected one of no magnetic true" in capsys.readouterr().err
+    assert main(["apply", "r.json", "r.csv", "--heading", "magnetc", "-o", "o.csv"]) == 2
+    assert capsys.readouterr().err.endswith("no magnetic true; did you mean 'magnetic'?\n")
+    (tmp_path / "r.csv").rename(tmp_path / "tru")  # a file, and no misspelt word
+    assert main(["apply", "r.json", "--heading", "tru", "-o", "o.csv"]) == 0
 
 
 def test_a_later_record_without_magnetometers_does_not_change_the_kind_of_heading(monkeypatch):

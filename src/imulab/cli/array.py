@@ -329,7 +329,7 @@ def _load(name: str, option: str) -> Calibration:
 
     if option == "--initial-bias" and not Path(name).exists():
         raise OptionError(
-            f"--initial-bias {name!r}: expected first, zero, or the file of a record{meant(['first', 'zero'], name)}"
+            f"--initial-bias {name!r}: expected first, zero, or the file of a record{meant(STARTS, name)}"
         )
     record = load(name)
     check_calibration(record, name)

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 from imulab import arguments
@@ -159,7 +160,7 @@ def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], s
         return refuse(f"No such option: {flag}", meant([*known, *opposite], flag, ALIKE))
 
     def take(each: Option, flag: str, value: str | None, left: list[str]) -> None:
-        if value is None and each.reads.bare and (not left or left[0] not in each.words):
+        if value is None and each.reads.bare and not (left and _is_word(left[0], each.words)):
             typed[each.keyword] = each.reads.bare
         elif each.takes_value:
             if value is None and not left:
@@ -205,6 +206,11 @@ def values_of(command: Command, words: Sequence[str]) -> tuple[dict[str, Any], s
     if rest:
         raise refuse(f"Got unexpected extra argument(s) ({' '.join(rest)})")
     return values, {*typed}
+
+
+def _is_word(word: str, known: Sequence[str]) -> bool:
+    """Return whether a word behind an option that needs none is its value, perhaps misspelt, or the next argument."""
+    return word in known or (word.isalpha() and meant(known, word) != "" and not Path(word).exists())
 
 
 def _quoted(flag: str) -> str:

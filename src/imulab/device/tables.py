@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imulab.device import METHODS, STARTS
-from imulab.errors import OptionError, RecordError, listed
+from imulab.errors import OptionError, RecordError, listed, meant
 from imulab.recording import Array, Recording
 from imulab.records.calibration import BLOB_MAGIC, Calibration
 from imulab.units import conversion_factor, from_si
@@ -272,7 +272,8 @@ def array_table(settings: ArraySettings) -> DeviceTable:
         raise OptionError(f"rate {s.rate}: expected more than 0 Hz")
     stated_bias = s.initial_bias if not isinstance(s.initial_bias, str) else None
     if stated_bias is None and s.initial_bias not in STARTS:
-        raise OptionError(f"initial bias {s.initial_bias!r}: expected first, zero or biases")
+        hint = meant(STARTS, s.initial_bias)
+        raise OptionError(f"initial bias {s.initial_bias!r}: expected first, zero or biases{hint}")
 
     def samples(time: float, least: int) -> np.int64:
         return np.int64(min(max(round(time * s.rate), least), 2**31))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import DataError, OptionError
+from imulab.errors import DataError, OptionError, meant
 from imulab.estimation import TAUS
 from imulab.estimation._allan import fill_squares, integrate
 from imulab.estimation.decisions import NOISE_MODEL_REJECTED
@@ -125,7 +125,7 @@ def _averages(length: int, rate: float, taus: str | Array) -> np.ndarray:
             steps = int(_DENSE_PER_DECADE * math.log10(most)) + 1
             counts = distinct(np.round(10 ** (np.arange(steps) / _DENSE_PER_DECADE))).astype(np.int64)
         else:
-            raise OptionError(f"taus {taus!r}: expected {' or '.join(TAUS)}")
+            raise OptionError(f"taus {taus!r}: expected {' or '.join(TAUS)}{meant(TAUS, taus)}")
     else:
         times = np.asarray(taus, dtype=np.float64)
         if not np.isfinite(times).all():

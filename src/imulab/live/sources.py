@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from imulab.errors import OptionError, ReadError, listed, meant
+from imulab.errors import OptionError, ReadError, meant
 from imulab.live.links import CHUNK, GONE, AbsentError, Link, LinkKind, reason, serial_link, tcp_link, udp_link
 from imulab.procedures.tumble.simulate import simulate_tumble
 from imulab.quantities import number, quantity, whole_number
@@ -465,7 +465,8 @@ def open_source(
             )
         unit, speed = simulated_unit(rest, follow=follow)
         return Simulated("simulated unit", unit, speed)
-    raise OptionError(f"source {text!r}: expected one of {listed(KINDS, text)}")
+    hint = meant([*kinds, "replay", "simulate"], kind)
+    raise OptionError(f"source {text!r}: expected one of {' '.join(KINDS)}{hint}")
 
 
 def _replay(rest: str, layout: str | None, units: Mapping[str, str] | None) -> LiveSource:

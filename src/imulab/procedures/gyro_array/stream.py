@@ -278,7 +278,8 @@ class FuseOptions:
         if not 1 <= self.start <= MOST_COUNT:
             raise OptionError(f"memory growing:{self.start}: expected a count from 1 to {MOST_COUNT}")
         if isinstance(self.initial_bias, str) and self.initial_bias not in STARTS:
-            raise OptionError(f"initial bias {self.initial_bias!r}: expected first, zero or a record")
+            hint = meant(STARTS, self.initial_bias)
+            raise OptionError(f"initial bias {self.initial_bias!r}: expected first, zero or a record{hint}")
         if self.method == "covariance" and self.calibration is None:
             raise OptionError("method covariance needs --calibration RECORD: its weights come from a recording at rest")
         if isinstance(self.calibration, Blob):

@@ -17,6 +17,8 @@ GAUGE = "body, rotation not told"
 FEWEST = {3: 12, 2: 8}
 """Readings that a fit takes at least, by the number of axes that were turned."""
 ALL_WAYS, LEVEL = "all ways", "level"
+TURNS = ("wave", "level")
+"""How a unit is turned: waved through all directions, or turned level."""
 
 
 def name_columns(samples: NDArray[Any]) -> Mapping[str, Any]:

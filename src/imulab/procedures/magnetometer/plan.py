@@ -12,9 +12,9 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, meant
 from imulab.options import choice, measure
-from imulab.procedures.magnetometer import FEWEST
+from imulab.procedures.magnetometer import FEWEST, TURNS
 from imulab.procedures.magnetometer.model import parameter_names
 from imulab.procedures.magnetometer.solve import Surface, evaluate, even_directions, pairs, uncertainties
 from imulab.procedures.result import PlannedTest, amount
@@ -23,7 +23,6 @@ from imulab.recording import Array
 from imulab.report.traces import plain_number
 from imulab.units import from_si
 
-_TURNS = ("wave", "level")
 _TILTS = (20.0, 30.0, 45.0, 60.0, 90.0, 180.0)  # deg, largest tilts that a plan compares
 _COUNTS = (12, 16, 24, 50, 100, 200, 500, 1000, 2000, 5000)
 _MOST = 1_000_000
@@ -127,7 +126,7 @@ class MagnetometerPlan(PlannedTest):
 
 def plan_magnetometer(
     *,
-    turn: Annotated[str, choice(_TURNS)] = "wave",
+    turn: Annotated[str, choice(TURNS)] = "wave",
     wanted: Annotated[float | str, measure("angle", "deg")] = "0.2 deg",
     readings: int | str | None = None,
     tilt: Annotated[float | str, measure("angle", "deg")] = "180 deg",
@@ -167,8 +166,8 @@ def plan_magnetometer(
     >>> plan.chosen.direction <= plan.wanted
     True
     """
-    if turn not in _TURNS:
-        raise OptionError(f"turn {turn!r}: expected {' or '.join(_TURNS)}")
+    if turn not in TURNS:
+        raise OptionError(f"turn {turn!r}: expected {' or '.join(TURNS)}{meant(TURNS, turn)}")
     target, largest = in_si(wanted, "wanted", "angle", "deg"), in_si(tilt, "tilt", "angle", "deg")
     size, spread = in_si(field, "field", "magnetic field", "uT"), in_si(noise, "noise", "magnetic field", "uT")
     angle = in_si(dip, "dip", "angle", "deg")

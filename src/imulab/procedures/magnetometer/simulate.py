@@ -9,22 +9,22 @@ from typing import Annotated
 
 import numpy as np
 
-from imulab.errors import OptionError
+from imulab.errors import OptionError, meant
 from imulab.options import choice, measure
+from imulab.procedures.magnetometer import TURNS
 from imulab.quantities import in_si, whole
 from imulab.recording import Array, Recording
 
 _SOFT_IRON, _HARD_IRON = 0.05, 0.5  # of the field
 _RESOLUTION = 0.02  # uT
 _MOST_SAMPLES = 1e7
-_TURNS = ("wave", "level")
 _PACE = 1.1  # rad/s, of the hand about each axis
 _TURN = 15.0  # s, once around
 
 
 def simulate_magnetometer(
     *,
-    turn: Annotated[str, choice(_TURNS)] = "wave",
+    turn: Annotated[str, choice(TURNS)] = "wave",
     duration: Annotated[float | str, measure("time", "s")] = "60 s",
     rate: Annotated[float | str, measure("frequency", "Hz")] = "20 Hz",
     field: Annotated[float | str, measure("magnetic field", "uT")] = "48 uT",
@@ -67,8 +67,8 @@ def simulate_magnetometer(
     >>> il.simulate_magnetometer(turn="level", duration="30 s").units["mag_x"]
     'uT'
     """
-    if turn not in _TURNS:
-        raise OptionError(f"turn {turn!r}: expected {' or '.join(_TURNS)}")
+    if turn not in TURNS:
+        raise OptionError(f"turn {turn!r}: expected {' or '.join(TURNS)}{meant(TURNS, turn)}")
     length, per_second = in_si(duration, "duration", "time", "s"), in_si(rate, "rate", "frequency", "Hz")
     magnitude = 1e6 * in_si(field, "field", "magnetic field", "uT")
     spread, angle = 1e6 * in_si(noise, "noise", "magnetic field", "uT"), in_si(dip, "dip", "angle", "deg")

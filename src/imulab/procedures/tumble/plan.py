@@ -743,8 +743,11 @@ def candidates_of(source: Any) -> Array | None:
         if colon and kind in ("fixture", "head"):
             angle = quantity(step, f"from_ {kind}", "angle", "deg")
             return fixture_candidates(angle) if kind == "fixture" else head_candidates(angle)
-        if colon and not Path(source).exists():
-            raise OptionError(f"from_ {source!r}: expected {', '.join(STARTS)} (steps in deg) or a file of directions")
+        hint = meant((each.partition(":")[0] for each in STARTS), kind)
+        if (colon or hint) and not Path(source).exists():
+            raise OptionError(
+                f"from_ {source!r}: expected {', '.join(STARTS)} (steps in deg) or a file of directions{hint}"
+            )
     if isinstance(source, np.ndarray | list | tuple):
         return _unit_vectors(source, "from_")
     recording = as_recording(source, {}, plan_tumble, name="from_")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from imulab.device.imus import NO_LIMIT, FusedImus, ImusSettings, ImusStream
 from imulab.device.unit import ALONE, BEYOND, EXCLUDED, GATED, NOT_FINITE, STUCK, Blob, is_blob, load_blob
 from imulab.display import Finding, Note, join_alike, prefixed
-from imulab.errors import DataError, OptionError, RecordError
+from imulab.errors import DataError, OptionError, RecordError, meant
 from imulab.estimation.clock import GAP
 from imulab.options import RARE, READING, measure, parsed, text
 from imulab.procedures.gyro_array.elements import SampleClock
@@ -119,7 +119,10 @@ def point_of(at: str, position: Array, noise: Array) -> Array:
     except ValueError:
         point = np.empty(0)
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise OptionError(f"--at {at!r}: expected centroid, imu:N, or x,y,z in m from IMU 1, such as 0.01,0,-0.005")
+        raise OptionError(
+            f"--at {at!r}: expected centroid, imu:N, or x,y,z in m from IMU 1, such as 0.01,0,-0.005"
+            f"{meant(['centroid', 'imu'], kind)}"
+        )
     return point
 
 

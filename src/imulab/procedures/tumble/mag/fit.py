@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from imulab.columns import triad
 from imulab.display import UNJUDGED, Bad, Finding, Note
-from imulab.errors import DataError, OptionError, listed, quoted
+from imulab.errors import DataError, OptionError, listed, meant, quoted
 from imulab.estimation.decisions import (
     DIP_MOVES_ACCELEROMETERS,
     DIP_OFF_STATED,
@@ -668,11 +668,11 @@ def _with_place(record: Calibration, where: Site, field: ModelField) -> Calibrat
 
 
 def _check_options(loss: str, mag_order: int | str, order: int | str, field: float | None) -> None:
-    for name, value, choices in (("loss", loss, LOSSES), ("mag-order", str(mag_order), MAG_ORDERS)):
+    for name, value, choices in (("loss", loss, LOSSES), ("mag_order", str(mag_order), MAG_ORDERS)):
         if value not in choices:
             raise OptionError(f"{name} {quoted(value)}: expected one of {listed(choices, str(value))}")
     if str(order) not in ("auto", "1", "2", "3", "4", "5"):
-        raise OptionError(f"order {quoted(order)}: expected auto or 1 to 5")
+        raise OptionError(f"order {quoted(order)}: expected auto or 1 to 5{meant(['auto'], order)}")
     check_field(field)
 
 

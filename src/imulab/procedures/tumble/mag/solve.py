@@ -33,7 +33,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
-from imulab.errors import OptionError, quoted
+from imulab.errors import OptionError, meant, quoted
 from imulab.estimation.decisions import FIELD_SCATTERS, HEMISPHERE_OF_DIP
 from imulab.estimation.least_squares import chi_square_probability
 from imulab.gravity import Gravity
@@ -82,7 +82,8 @@ def parse_place(hemisphere: str | None, latitude: float | str | None, dip: Dip |
         There is no such hemisphere or dip, or they contradict one another.
     """
     if hemisphere is not None and hemisphere not in HEMISPHERES:
-        raise OptionError(f"hemisphere {quoted(hemisphere)}: expected north or south")
+        hint = meant(HEMISPHERES, hemisphere)
+        raise OptionError(f"hemisphere {quoted(hemisphere)}: expected {' or '.join(HEMISPHERES)}{hint}")
     known = None if dip is None else parse_dip(dip)
     sides = {"hemisphere": hemisphere, "latitude": hemisphere_at(latitude)}
     if known is not None and abs(known[0]) > HEMISPHERE_OF_DIP.limit * known[1]:
