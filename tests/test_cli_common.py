@@ -5,12 +5,15 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+import imulab as il
 from imulab.cli import main
 from imulab.cli import options as speech
-from imulab.errors import listed, meant
+from imulab.cli.options import naming
+from imulab.errors import OptionError, UnitError, listed, meant
 
 
 @pytest.fixture
@@ -252,3 +255,13 @@ def test_a_warning_is_no_note_as_well(capsys):
         for message in ("truncated", "f.csv: truncated", "cut"):
             speech.note(message)
     assert capsys.readouterr().err == "imulab: warning: f.csv: truncated\nimulab: note: cut\n"
+
+
+def test_a_file_is_named_once_whatever_it_is_called(tmp_path, monkeypatch):
+    for name, message in (("a", "a noise record cannot be applied"), ("a", "a: no samples"), ("x.csv", "no samples")):
+        with pytest.raises(OptionError, match=rf"^{name}: {message.removeprefix('a: ')}$"), naming(name):
+            raise OptionError(message)
+    monkeypatch.chdir(tmp_path)
+    Path("u").write_text("time [s],accel_x [gg]\n0,1\n")
+    with pytest.raises(UnitError, match=r"^u: column accel_x: unknown unit 'gg'"):
+        il.read("u")

@@ -124,7 +124,7 @@ def parse_column_title(title: str, file: str, units: Mapping[str, str] | None = 
         check_unit(name, unit.symbol, file)
         return name, unit.symbol
     except UnitError as error:
-        if str(error).startswith(file):
+        if str(error).startswith(f"{file}:"):
             raise
         if expected_quantities(name) is None and symbol:
             return name, symbol  # not ours to convert: it passes through

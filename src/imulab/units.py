@@ -256,7 +256,6 @@ def si_unit(symbol: str) -> str:
     return next((other.symbol for other in of_it if other.factor == 1.0 and other.offset == 0.0), unit.symbol)
 
 
-TIME_DOUBTED = "is the unit of time right"
 _LIKELY_RATES, _LIKELY_DURATIONS = (1.0, 10_000.0), (10.0, 7 * 86_400.0)
 """Rates, Hz, and durations, s, of tests: what else a unit of time may be makes both likely."""
 
@@ -278,7 +277,7 @@ def likely_times(unit: str, rate: float, duration: float) -> str:
 def ask_unit_of_time(unit: str, rate: float, duration: float) -> str:
     """Return the question whether a unit of time is right, with what else it may be."""
     likely = likely_times(unit, rate, duration)
-    return f"{TIME_DOUBTED}{': ' if likely else ''}{likely}?"
+    return f"is the unit of time right{': ' if likely else ''}{likely}?"
 
 
 def conversion_factor(source: str, target: str) -> float:

@@ -318,7 +318,7 @@ def naming(file: str) -> Iterator[None]:
     try:
         yield
     except ImulabError as error:
-        if str(error).startswith(file):
+        if str(error).startswith(f"{file}:"):
             raise
         raise type(error)(f"{file}: {error}") from None
 

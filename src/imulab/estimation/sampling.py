@@ -59,6 +59,18 @@ class StampFinding(Finding):
     __slots__ = ()
 
 
+class TimeUnitNote(Note):
+    """The question whether the unit of time is right, where the rate is only rare."""
+
+    __slots__ = ()
+
+
+class TimeUnitFinding(Finding):
+    """The same, where rate or duration are hardly those of a test."""
+
+    __slots__ = ()
+
+
 def mend_stamps(recording: Recording) -> Recording:
     """Return a recording whose time rises, with notes on what was done for that (`read_clock`).
 
@@ -368,7 +380,7 @@ def mislabelled(
     doubt = doubt_unit_of_time(recording.units["time"], rate, duration, rare=slow or short, odd=odd)
     if not doubt:
         return []
-    kind = Finding if odd or short or rate > _FAST else Note
+    kind = TimeUnitFinding if odd or short or rate > _FAST else TimeUnitNote
     return [
         kind(
             f"{doubt} If not, every figure that depends on time is wrong",

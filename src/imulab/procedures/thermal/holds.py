@@ -26,11 +26,12 @@ from imulab.errors import DataError, OptionError
 from imulab.estimation.decisions import DIRECTION_WANDERS
 from imulab.estimation.likely_unit import no_gravity
 from imulab.estimation.rows import MAD_TO_SIGMA, distinct, median, medians, quantile
+from imulab.estimation.sampling import TimeUnitFinding, TimeUnitNote
 from imulab.procedures.thermal import LEAST_SPAN, SETTLE
 from imulab.procedures.tumble.attitudes import POOL_DEGREES, Attitudes, attitudes_and_samples
 from imulab.recording import Array, Recording, check_finite
 from imulab.records.comparison import different_units
-from imulab.units import TIME_DOUBTED, parse_unit
+from imulab.units import parse_unit
 
 # Recordings at rest while the temperature drifts: knocks, and wander of the direction.
 
@@ -294,7 +295,7 @@ def _join_rest(attitudes: Attitudes, outputs: Array) -> Attitudes:
     if edges is None:
         return attitudes
     # A ramp through the temperatures needs no more than a sample now and then.
-    notes = tuple(note for note in attitudes.notes if TIME_DOUBTED not in note)
+    notes = tuple(note for note in attitudes.notes if not isinstance(note, TimeUnitNote | TimeUnitFinding))
     if len(edges) > 1:
         first, lost = time[edges[0, 1]], 100 * (1 - np.diff(edges).sum() / len(time))
         sentence = (
