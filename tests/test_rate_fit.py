@@ -279,6 +279,14 @@ def test_a_clock_that_turns_an_angle_into_a_rate_shows_by_the_listed_rates_or_is
     assert all(said in w for w in about)
 
 
+@pytest.mark.parametrize(("factor", "largest"), [(180 / np.pi, "11459"), (np.pi / 180, "3.491"), (1.3, "260.0")])
+def test_listed_rates_in_another_unit_than_the_angle_are_no_fault_of_a_clock(factor, largest):
+    record = il.fit_rate(by_angle(0.0), rates=factor * DEGREE * np.array(WAY), latitude=0.0).calibration
+    (said,) = [w for w in record.warnings if "table_angle" in w]
+    assert f"up to 200.0 deg/s, are not those listed, up to {largest} deg/s" in said
+    assert record.verdict.state == "look"
+
+
 def test_a_clock_is_not_asked_for_where_the_table_wrote_its_rate_too():
     record = il.fit_rate(by_angle(3e-3, column=True)).calibration
     assert not any("table_angle" in w for w in record.warnings)

@@ -39,7 +39,8 @@ from imulab.records.calibration import Calibration, Covariance, Parameter
 from imulab.records.comparison import different_units
 from imulab.records.sections import Quantity, entries
 from imulab.report.parameters import text_in
-from imulab.units import parse_unit
+from imulab.report.traces import plain_number
+from imulab.units import from_si, parse_unit
 
 # Sweeps in a rate record: delay and bandwidth of each gyroscope, and the frequency of a single sine.
 
@@ -119,6 +120,7 @@ def note_sweeps(test: RateTest, dwells: Sequence[Dwells]) -> list[str]:
 _MATTERS = 3.0  # times the uncertainty of a bias: the Earth's rate is warned of if it is larger
 _LARGEST = ("nonlinearity", "hysteresis")  # maxima of absolute values
 _CLOCK = 1e-4  # relative standard uncertainty of table and clock together where none was stated
+_NO_CLOCK = 0.1  # relative: no clock is so far off
 
 
 def make_record(
@@ -366,7 +368,17 @@ def _warn_clock(test: RateTest, recordings: Sequence[Recording], dwells: Sequenc
     rates, key = np.unique(listed, return_inverse=True)
     means = np.bincount(key, recorded) / np.bincount(key)
     square = float(rates @ rates)
-    error = float(rates @ (means - rates)) / square
+    error = float(rates @ (means - rates)) / square if square else np.inf
+    if abs(error) > _NO_CLOCK:
+        largest = float(np.abs(recorded).max()), max(max(map(abs, each)) for each, _ in pairs)
+        by_table_angle, in_list = (plain_number(from_si(rate, "deg/s"), 4) for rate in largest)
+        return [
+            Finding(
+                f"the rates by table_angle, up to {by_table_angle} deg/s, are not those "
+                f"listed, up to {in_list} deg/s; the scale factors are by table_angle",
+                "correct the unit of table_angle, or that of the listed rates",
+            )
+        ]
     scatter = np.sqrt(np.sum((means - (1 + error) * rates) ** 2) / max(len(rates) - 1, 1) / square)
     limit = coverage_factor(None, 0.999) * (_CLOCK if stated is None else stated)
     if abs(error) < limit + coverage_factor(len(rates) - 1, 0.999) * float(scatter) + EXACT:
