@@ -423,6 +423,7 @@ def replaced(**columns):
         ),
         (log, {"horizon": -1.0}, OptionError, "horizon -1 s: expected more than 0"),
         (log, {"band": 0.0}, OptionError, "band 0 Hz: expected more than 0"),
+        (log, {"band": 1e-5}, OptionError, "band: expected 0.000833 Hz, the lowest frequency that these data show"),
         (log, {"regress": "pressure"}, OptionError, "regress 'pressure': expected one of time temperature"),
         (log, {"regress": "temperature"}, DataError, "rest.csv: regress temperature: expected a column temperature"),
         (log, {"steps": "keep"}, OptionError, "steps 'keep': expected one of say remove"),
@@ -434,6 +435,15 @@ def test_what_cannot_be_is_refused_in_one_line(made, options, error, message):
     with pytest.raises(error, match=message) as refused:
         il.fit_noise(made(), **options)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"), [(["--horizon", "5000"], "--horizon 5000 s: expected at"), (["--band", "1e-5"], "--band: ex")]
+)
+def test_a_fit_calls_options_as_they_are_typed(tmp_path, capsys, words, message):
+    il.write_csv(log(), tmp_path / "rest.csv")
+    assert main(["noise", "fit", str(tmp_path / "rest.csv"), *words]) == 2
+    assert capsys.readouterr().err.startswith(f"imulab: {message}")
 
 
 def test_arrays_and_files_are_taken_alike(tmp_path):

@@ -110,6 +110,7 @@ def doubt_rates(recording: Recording) -> str:
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of wild readings
 def unit_by_turns(force: Array, rate: Array, step: float) -> str:
     """Return the unit of rates, (n, 3), in which they explain how gravity turns in the body, or "".
 
@@ -126,10 +127,10 @@ def unit_by_turns(force: Array, rate: Array, step: float) -> str:
     w = w - np.median(w, axis=0)
     change = (f[2 * lag :] - f[: -2 * lag]) / (2 * lag * step)
     turned = -np.cross(w, f)[lag:-lag]
-    both, alone, seen = (float((a * b).sum()) for a, b in ((change, turned), (turned, turned), (change, change)))
-    if not alone or not seen or both / np.sqrt(alone * seen) < _AGREE:
+    shared, of_rates, of_force = float((change * turned).sum()), float((turned**2).sum()), float((change**2).sum())
+    if not of_rates or not of_force or not shared / np.sqrt(of_rates * of_force) >= _AGREE:
         return ""
-    factor = both / alone
+    factor = shared / of_rates
     units = ("rad/s", "deg/s", "mdeg/s")
     return next((unit for unit in units if 1 / _TWICE < factor / parse_unit(unit).factor < _TWICE), "")
 

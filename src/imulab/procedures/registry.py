@@ -22,6 +22,7 @@ from imulab.procedures.rate.procedure import RateProcedure
 from imulab.procedures.thermal.procedure import ThermalProcedure
 from imulab.procedures.tumble.procedure import TumbleProcedure
 from imulab.procedures.warmup.procedure import WarmupProcedure
+from imulab.quantities import labelled
 from imulab.records.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -168,10 +169,11 @@ def run_task(
     task = PROCEDURES[name].task
     texts = {key.rstrip("_"): _text(value) for key, value in options.items() if value is not None}
     values = task.values(texts, label)
-    try:
-        return task.fit(files, values, access, progress)
-    except RecordError as error:
-        file = options.get(str(error).partition(":")[0])
-        if file is None:
-            raise
-        raise RecordError(f"{file}: {error}") from None
+    with labelled(label, options):
+        try:
+            return task.fit(files, values, access, progress)
+        except RecordError as error:
+            file = options.get(str(error).partition(":")[0])
+            if file is None:
+                raise
+            raise RecordError(f"{file}: {error}") from None

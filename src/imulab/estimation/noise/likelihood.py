@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from imulab.errors import OptionError
 from imulab.estimation.decisions import BIN_OFF_MODEL
 from imulab.estimation.noise.spectrum import Spectrum, frequencies
 from imulab.estimation.noise.terms import LINEAR, NAMES, SIGMA, TIME, Bins
@@ -239,12 +240,20 @@ def time_limits(spectra: Sequence[Spectrum]) -> tuple[float, float]:
     """Return the least and the greatest time constant that spectra show, s: 2/f_max and the longest stretch.
 
     A shorter one is white noise up to the highest frequency of the spectra, f_max; a longer one is a walk.
+
+    Raises
+    ------
+    OptionError
+        The band that was asked for ends below the lowest frequency of the spectra.
     """
     highest = [
         float(each.last[counted[-1]]) / (2 * each.length)
         for each in spectra  # those of the upper frequencies have none in a narrow band
         if (counted := np.flatnonzero(np.atleast_2d(each.freedom).any(axis=0))).size
     ]
+    if not highest:
+        lowest = min(float(each.last[0]) / (2 * each.length) for each in spectra)
+        raise OptionError(f"band: expected {lowest:.3g} Hz, the lowest frequency that these data show, or more")
     return 2 / max(highest), max(each.length for each in spectra)
 
 
