@@ -448,3 +448,11 @@ def test_long_runs_are_those_between_all_changes(at_once, monkeypatch):
             first, behind = long_runs(values, least)
             assert first.tolist() == edges[:-1][long].tolist()
             assert behind.tolist() == edges[1:][long].tolist()
+
+
+@pytest.mark.parametrize(
+    ("values", "step"),
+    [([], 0.0), ([3.0], 0.0), ([1.0, 1.0], 0.0), ([0.5, 2.0, 1.0], 0.5), ([np.nan, 1.0, np.nan, 3.0, -np.inf], 2.0)],
+)
+def test_the_resolution_is_the_smallest_step_of_finite_values(values, step):
+    assert rows.resolution(np.array(values)) == step

@@ -66,12 +66,12 @@ def test_the_longest_stretch_at_rest_is_used_and_said(kind):
     record = calibrate_array(array_recording(readings, 100.0, "s.csv")).calibration
     (line,) = [w for w in record.warnings if "at rest" in w]
     assert "s.csv: not at rest throughout (gyro_" in line
-    assert "used is the longest stretch at rest, 30 to 69.99 s (39.99 of 89.99 s); --interval" in line
+    assert "used is the longest stretch at rest, 30 to 69.99 s (39.99 of 89.99 s); --window" in line
     assert record.fit["samples"] == 4000
     found = np.array([e["bias"]["value"] for e in record.sections["elements"]]).T
     np.testing.assert_allclose(found, DEG * readings[3000:7000].mean(axis=0), atol=1e-12)
     assert record.verdict.state == "look"
-    assert record.verdict.next == ("record again at rest, or state the part at rest (--interval)",)
+    assert record.verdict.next == ("record again at rest, or state the part at rest (--window)",)
 
 
 def test_a_board_of_whole_imus_that_moved_is_sent_to_their_calibration():

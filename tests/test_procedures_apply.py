@@ -630,6 +630,8 @@ def test_the_unit_of_gyroscopes_is_not_asked_for_where_nothing_tells(turned_by_h
     assert il.apply(made, still).notes == ()  # at rest
     shaken = {name: wrong.column(name) + np.random.default_rng(1).normal(0, 30, len(wrong)) for name in AXES}
     assert il.apply(made, wrong.with_columns(shaken, {})).notes == ()
+    wild = {"accel_z": wrong.column("accel_z") * np.where(np.arange(len(wrong)) < 300, 1e200, 1.0)}  # overflows squares
+    assert il.apply(made, wrong.with_columns(wild, {})).notes == ()
     gyros = Recording({name: wrong.column(name) for name in ("time", *GYROS)}, wrong.units, name="f.csv")
     assert warn_of_unit(loaded(made), gyros) == []
     # A record whose scale factors have the same wrong unit makes the rates right.

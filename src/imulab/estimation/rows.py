@@ -99,8 +99,9 @@ def distinct(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def resolution(samples: Array) -> float:
-    """Return the smallest step between different values of the first 20,000 samples, or 0 where all are the same."""
+    """Return the smallest step between different finite values of the first 20,000 samples, 0 where there is none."""
     values = distinct(samples[:20_000])
+    values = values[np.isfinite(values)]
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
 
 

@@ -230,9 +230,9 @@ def _still_part(left_out: LeftOut, elements: Elements) -> tuple[Recording, list[
     whole = all(f"accel_{axis}_{k}" in still.columns for axis in "xyz" for k in range(1, elements.count + 1))
     shortened = Finding(
         f"{still.name}: not at rest throughout ({rest.moved}): used is the longest stretch at rest, {first:.6g} to "
-        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --interval FROM:TO chooses another",
+        f"{last:.6g} s ({last - first:.4g} of {time[-1] - time[0]:.4g} s); --window FROM:TO chooses another",
         ("calibrate the whole IMUs (array calibrate --imus), or " if whole else "")
-        + "record again at rest, or state the part at rest (--interval)",
+        + "record again at rest, or state the part at rest (--window)",
     )
     return part, [shortened], sampling_rate(part)
 
@@ -317,7 +317,7 @@ def _warn_steps(still: Recording, elements: Elements, rest: AtRest) -> list[str]
     return [
         Finding(
             f"the level changes at rest: {first_of(steps, 3)}; the bias is the mean of both levels",
-            "record again at rest, or read the part after the change (--interval)",
+            "record again at rest, or read the part after the change (--window)",
         )
     ]
 

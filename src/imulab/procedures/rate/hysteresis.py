@@ -152,7 +152,10 @@ def test_bend(
 def _fit_shapes(
     shapes: Array, beside: Array, rate: Array, values: Array, noise: Array, runs: NDArray[Any], time: Array
 ) -> tuple[float, float, float] | None:
-    """Return `_average_models` of `shapes` beside columns, and a zero and a drift of it in each run; None without."""
+    """Return coefficient of the shapes, its uncertainty, and the probability that noise makes it; None if not visible.
+
+    Columns `beside` them, and a zero and a linear drift of it in each run, are taken off first. Models are averaged.
+    """
     number, which = np.unique(runs, return_inverse=True)
     within = time - np.array([time[runs == run].min() for run in number])[which]
     of_run = np.eye(len(number))[which]
@@ -170,7 +173,7 @@ def _fit_shapes(
 def _average_models(
     noise: Array, parts: list[Array], shapes: Array, values: Array, number: int
 ) -> tuple[float, float, float]:
-    """Return mean and standard uncertainty of half the loop, and the probability that noise alone makes it.
+    """Return mean and standard uncertainty of the coefficient of shapes, and the probability that noise makes it.
 
     The covariance is that of the noise and each of three parts in one of `number` sizes, or not at all.
     """

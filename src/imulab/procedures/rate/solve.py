@@ -597,10 +597,10 @@ def measure_linearity(problem: RateProblem, gyro: int, scale: float, order: int,
     )
     bend = 1.0
     if not branch.any() and problem.time is not None:
-        steps, seen = (rate / largest, values / largest, variance / largest**2), (key, runs, problem.time[on_axis])
-        bend = test_bend(*steps, of_rate / largest**2, *seen, order)
+        steps, visits = (rate / largest, values / largest, variance / largest**2), (key, runs, problem.time[on_axis])
+        bend = test_bend(*steps, of_rate / largest**2, *visits, order)
         if loop is not None:
-            loop, fitted_loop = fit_loop(*steps, *seen, direction, walk / (scale * largest) ** 2) or (None, None)
+            loop, fitted_loop = fit_loop(*steps, *visits, direction, walk / (scale * largest) ** 2) or (None, None)
     return Linearity(
         rate=rate,
         residual=left / largest,

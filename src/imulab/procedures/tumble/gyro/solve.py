@@ -432,7 +432,7 @@ class TurnReadings(Struct, frozen=True, dict=True):
     def _inside(
         self, first: Windows, last: Windows, hold: NDArray[np.intp], rest: GyroRest, moved: Array | float
     ) -> Segments:
-        """Return the turns from windows to later ones of the same holds; `moved` is what each hold's zero differs."""
+        """Return the turns from windows to later ones of the same holds; the zero of each hold differs by `moved`."""
         output = self.case.output
         if rest.slope is not None:
             output = output - self.case.force_at(self.stamps.on_accel) @ rest.slope.T

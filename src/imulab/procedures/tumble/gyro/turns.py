@@ -231,7 +231,10 @@ def directions_missed(segments: Segments, scale: Array, theta: Array) -> Array:
 
 
 def directions_smeared(segments: Segments, derivatives: Array, scale: Array, theta: Array) -> Array:
-    """Return the derivatives of the residuals by what is added of derivatives of the output, (k, m, n, 3); (3 m, k)."""
+    """Return how `directions_missed` change per unit of each derivative that is added to the output, shape (3 m, k).
+
+    `derivatives` are those of the output over time, such as the second and the third, shape (k, m, n, 3).
+    """
     missed = directions_missed(segments, scale, theta)
     columns = [
         directions_missed(replace(segments, output=segments.output + _STEP * each), scale, theta) - missed
