@@ -45,6 +45,13 @@ addEventListener("pointermove", event => { if (pressed && !event.buttons) freed(
 
 export const unpressed = async () => pressed;
 
+// A double click, or Enter held down, is one click: what it starts is started once. The range of plots moves with each.
+const startsOnce = event => event.target.closest?.("button, a.button, input") && !event.target.closest(".tool");
+addEventListener("click", event => {
+  if (event.detail > 1 && startsOnce(event) && event.target.type !== "checkbox") { event.preventDefault(); event.stopImmediatePropagation(); }
+}, true);
+addEventListener("keydown", event => { if (event.repeat && event.key === "Enter" && startsOnce(event)) event.preventDefault(); }, true);
+
 let plotly = null;
 // Plotly, loaded when it is first asked for.
 export function loadPlotly() {

@@ -7,7 +7,7 @@ import { columnTable, layoutList } from "./bench/columns.js";
 import { form } from "./bench/form.js";
 import { card, from } from "./bench/job.js";
 import { alike, fileList, kindOf } from "./bench/list.js";
-import { address, ask, send } from "./bench/net.js";
+import { address, ask, askOnce, send } from "./bench/net.js";
 import { plots } from "./bench/plot.js";
 import { inAddress, keep, recall, toAddress } from "./bench/state.js";
 import { likely, reason } from "./bench/suits.js";
@@ -221,7 +221,7 @@ function heading() {
 
 function remove() {
   if (confirm(`Remove ${chosen.short} from the folder ${folder}?`)) {
-    ask(`files/${encodeURIComponent(chosen.name)}`, undefined, { method: "DELETE" }).catch(fail);
+    askOnce(`files/${encodeURIComponent(chosen.name)}`, undefined, { method: "DELETE" }).catch(fail);
   }
 }
 
@@ -364,7 +364,7 @@ function summary({ head, done, attitudes, turned }) {
 
 // A record, and other files
 
-const start = (command, values) => ask("jobs", { command, values }).then(job => { if (!cards.has(job.number)) worked(job); }); // else a message was first
+const start = (command, values) => askOnce("jobs", { command, values }).then(job => { if (!cards.has(job.number)) worked(job); }); // else a message was first
 const targets = () => (forms.find(each => each.path === "export")?.fields.find(each => each.name === "to")?.choices || []).filter(each => each !== "c");
 
 function record() {

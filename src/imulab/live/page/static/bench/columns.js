@@ -2,7 +2,7 @@
 // what each column is.
 
 import { h, put, show } from "../dom.js";
-import { ask } from "./net.js";
+import { ask, askOnce } from "./net.js";
 import { pretty } from "./units.js";
 
 const triad = (sensor, name) => [name, ["x", "y", "z"].map(axis => [`${sensor}_${axis}`, `${sensor} ${axis}`])];
@@ -78,7 +78,7 @@ export function columnTable(file, told, act) {
     clearTimeout(later);
     later = setTimeout(preview, SOON);
   }
-  const send = more => ask("columns", { file: file.name, columns: stated(), sample_rate: rate.value.trim(), ...more });
+  const statement = more => ["columns", { file: file.name, columns: stated(), sample_rate: rate.value.trim(), ...more }];
 
   async function preview() {
     const own = asked += 1;
@@ -87,7 +87,7 @@ export function columnTable(file, told, act) {
     put(said, missing || "The plots below show the file read so.");
     if (missing) return;
     try {
-      const made = await send({});
+      const made = await ask(...statement({}));
       if (own === asked) act.preview(made.layout);
     } catch (error) {
       if (own !== asked) return;
@@ -99,7 +99,7 @@ export function columnTable(file, told, act) {
   const element = h("form", { class: "assistant", onsubmit: async event => {
     event.preventDefault();
     try {
-      act.saved((await send({ name: name.value.trim() || "layout" })).layout);
+      act.saved((await askOnce(...statement({ name: name.value.trim() || "layout" }))).layout);
     } catch (error) {
       put(said, error.message);
     }

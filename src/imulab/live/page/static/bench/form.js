@@ -49,7 +49,11 @@ export function form(definition, { files, values = {}, run, keep = () => {} }) {
   const element = h("form", { class: "form", novalidate: true, "data-asked": "", onsubmit: async event => {
     event.preventDefault();
     const values = read(); // what stands there at the click, whatever comes before the answer
-    if (await preview(values)) run(values).catch(say);
+    const text = JSON.stringify(values);
+    if (text === started) return; // it was clicked on already, and the answer is not here yet
+    started = text;
+    if (await preview(values)) await run(values).catch(say);
+    if (text === started) started = "";
   } },
     h("p", { class: "caption" }, inWords(definition.help)),
     h("div", { class: "fields" }, main.filter(({ of }) => of.kind !== "output").map(each => each.element)),
@@ -62,6 +66,7 @@ export function form(definition, { files, values = {}, run, keep = () => {} }) {
     h("div", { class: "fields" }, main.filter(({ of }) => of.kind === "output").map(each => each.element)),
     refused, h("p", { class: "go" }, go), h("p", { class: "same" }, "The command that does the same:"), line);
   let later = null;
+  let started = "";
   let version = 0; // of what is typed: an answer to an older one is late
 
   function read() {

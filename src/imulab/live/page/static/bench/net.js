@@ -25,6 +25,14 @@ export async function ask(what, body, options = {}) {
   throw new Error(said);
 }
 
+// As `ask`, of what starts something: what is asked again before it is answered is not done twice.
+const underway = new Map();
+export function askOnce(...question) {
+  const key = JSON.stringify(question);
+  if (!underway.has(key)) underway.set(key, ask(...question).finally(() => underway.delete(key)));
+  return underway.get(key);
+}
+
 // Sends a file, and tells how much of it has gone, from 0 to 1.
 export function send(file, tell) {
   return new Promise((done, failed) => {
