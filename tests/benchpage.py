@@ -10,6 +10,9 @@ from typing import Any
 
 import imulab as il
 
+PATIENCE = 180
+"""Seconds after which a test takes for hung what it waits for: no measure of speed, on the slowest machine either."""
+
 DROP = """([name, text]) => {
   const data = new DataTransfer();
   data.items.add(new File([text], name));
@@ -31,7 +34,7 @@ class Workbench:
 
     def close(self) -> None:
         self.process.terminate()
-        self.process.communicate(timeout=30)
+        self.process.communicate(timeout=PATIENCE)
 
 
 def tumble(name: str, **more: Any) -> str:
@@ -58,9 +61,9 @@ def command(page: Any) -> str:
     return page.locator(".form .command code").inner_text()
 
 
-def await_request(page: Any, held: list[Any], seconds: float = 60) -> None:
+def await_request(page: Any, held: list[Any]) -> None:
     """Wait until the page has asked for what a test holds back."""
-    ends = time.monotonic() + seconds
+    ends = time.monotonic() + PATIENCE
     while not held:
         assert time.monotonic() < ends, "the page has not asked"
         page.wait_for_timeout(20)

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import madeup
-from benchpage import Workbench
+from benchpage import PATIENCE, Workbench
 from imulab.cli import main
 from imulab.exporters import export
 from imulab.recording import Array, Recording
@@ -192,6 +192,11 @@ def browser(chromium: str) -> Iterator[Any]:
         found.close()
 
 
+def _checked_function(text: str) -> str:
+    assert "=>" in text, f"{text!r}: expected a function, which the policy of the page lets be called again"
+    return text
+
+
 @pytest.fixture
 def new_page(browser: Any) -> Iterator[Callable[[str], Any]]:
     """A function that opens an address; at the end no page may have reported a fault, nor one of its policy.
@@ -199,13 +204,15 @@ def new_page(browser: Any) -> Iterator[Callable[[str], Any]]:
     A test waits for a function, `() => ...`: a mere expression is evaluated anew in the page, which its policy forbids.
     """
     context = browser.new_context(viewport={"width": 1280, "height": 900}, accept_downloads=True)
-    context.set_default_timeout(60_000)
+    context.set_default_timeout(1000 * PATIENCE)
     faults: list[str] = []
 
     def opened(address: str) -> Any:
         page = context.new_page()
         page.on("pageerror", lambda error: faults.append(str(error)))
         page.on("console", lambda said: faults.append(said.text) if "Content Security" in said.text else None)
+        wait = page.wait_for_function
+        page.wait_for_function = lambda function, **more: wait(_checked_function(function), **more)
         page.goto(address)
         return page
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import imulab as il
+from benchpage import PATIENCE
 
 
 class Device:
@@ -152,7 +153,7 @@ class Process:
     def text(self) -> str:
         return "\n".join(line for _, line in self.lines)
 
-    def said(self, what: str, seconds: float = 180.0) -> float:
+    def said(self, what: str, seconds: float = PATIENCE) -> float:
         """Wait until it has said something, and return when; infinite if it never does."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -180,7 +181,7 @@ class Process:
         self._process.kill()
         self.ended()
 
-    def ended(self, seconds: float = 180.0) -> int:
+    def ended(self, seconds: float = PATIENCE) -> int:
         """Return the exit status; a process that does not end is killed, and the test fails."""
         try:
             status = self._process.wait(seconds)

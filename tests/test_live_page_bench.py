@@ -27,6 +27,7 @@ import pytest
 pytest.importorskip("starlette", reason="the page needs the extra live")
 
 import imulab as il
+from benchpage import PATIENCE
 from imulab.cli import main
 from imulab.cli.app import commands
 from imulab.errors import OptionError
@@ -204,8 +205,8 @@ def test_an_empty_folder_goes_with_its_session(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def until(condition: Callable[[], Any], seconds: float = 30) -> Any:
-    ends = time.monotonic() + seconds
+def until(condition: Callable[[], Any]) -> Any:
+    ends = time.monotonic() + PATIENCE
     while not (found := condition()):
         assert time.monotonic() < ends, "it has not come to that"
         time.sleep(0.02)
@@ -293,11 +294,11 @@ def bench(tmp_path, monkeypatch) -> Iterator[SimpleNamespace]:
     options = {"browser": False, "limit": 10**7, "tell": lines.put}
     thread = threading.Thread(target=server.serve, args=([part],), kwargs=options, daemon=True)
     thread.start()
-    host, _, token = lines.get(timeout=20).removeprefix("http://").partition("/?token=")
+    host, _, token = lines.get(timeout=PATIENCE).removeprefix("http://").partition("/?token=")
 
     def ask(path: str, body: Any = None, method: str | None = None, **headers: str) -> SimpleNamespace:
         data = json.dumps(body) if isinstance(body, dict) else body
-        connection = http.client.HTTPConnection(host, timeout=30)
+        connection = http.client.HTTPConnection(host, timeout=PATIENCE)
         given = {"x-imulab-token": token} | {key.replace("_", "-"): value for key, value in headers.items()}
         connection.request(method or ("POST" if data else "GET"), f"/api/workbench/{path}", data, given)
         answer = connection.getresponse()
@@ -307,7 +308,7 @@ def bench(tmp_path, monkeypatch) -> Iterator[SimpleNamespace]:
 
     yield SimpleNamespace(ask=ask, part=part)
     part._hub.stop()
-    thread.join(20)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
 
 
@@ -503,10 +504,13 @@ def test_a_certificate_of_a_record_is_written_beside_it(bench):
 
 def test_results_are_cleared_but_not_what_runs_nor_what_they_made(bench):
     fit = run(bench, "tumble simulate", output="own.csv")
-    more = bench.ask("jobs", {"command": "tumble simulate", "values": {"output": "b.csv", "attitudes": "200"}}).json()
+    longest = {"file": fit.outputs[0], "order": "2", "gravity": "9.81", "monte_carlo": "900000"}
+    more = bench.ask("jobs", {"command": "tumble fit", "values": longest}).json()
     assert bench.ask("results", None, "DELETE").status == 200
     assert fit.number not in bench.part._jobs.jobs
     assert Path(fit.outputs[0]).is_file()
+    assert bench.part._jobs.jobs[more["number"]].state == "running"
+    bench.ask(f"jobs/{more['number']}", None, "DELETE")
     assert until(lambda: bench.part._jobs.jobs[more["number"]].ended)
     assert run(bench, "tumble simulate", output="c.csv").number > more["number"]  # no number comes twice
     bench.ask(f"results/{more['number']}", None, "DELETE")
@@ -789,13 +793,13 @@ def test_ctrl_c_twice_leaves_no_command_behind(tmp_path):
     with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         assert process.stdout is not None
         host, _, token = process.stdout.readline().strip().removeprefix("http://").partition("/?token=")
-        connection = http.client.HTTPConnection(host, timeout=30)
+        connection = http.client.HTTPConnection(host, timeout=PATIENCE)
         values = {"file": "rec.csv", "order": "2", "monte_carlo": "900000"}
         body = json.dumps({"command": "tumble fit", "values": values})
         connection.request("POST", "/api/workbench/jobs", body, {"x-imulab-token": token})
         assert json.loads(connection.getresponse().read())["state"] == "running"
         before = until(lambda: children(process.pid))
-        stuck = http.client.HTTPConnection(host, timeout=30)  # an upload that hangs holds the first Ctrl-C up
+        stuck = http.client.HTTPConnection(host, timeout=PATIENCE)  # an upload that hangs holds the first Ctrl-C up
         stuck.putrequest("PUT", "/api/workbench/files/slow.csv")
         stuck.putheader("content-length", "100")
         stuck.putheader("x-imulab-token", token)
@@ -804,7 +808,7 @@ def test_ctrl_c_twice_leaves_no_command_behind(tmp_path):
         for _ in range(3):
             process.send_signal(signal.SIGINT)
             time.sleep(0.1)
-        process.wait(60)
+        process.wait(PATIENCE)
         stuck.close()
         connection.close()
     until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in before))
@@ -855,7 +859,7 @@ def test_closing_the_terminal_ends_the_workbench(tmp_path):
         assert process.stdout is not None
         assert "token=" in process.stdout.readline()
         process.send_signal(signal.SIGHUP)
-        assert process.wait(20) == 0
+        assert process.wait(PATIENCE) == 0
     assert list(tmp_path.iterdir()) == []
 
 
@@ -864,7 +868,8 @@ def test_the_folders_of_a_killed_program_go_at_the_next_start(tmp_path, monkeypa
     script = (
         "import os\nfrom imulab.live.page.files import Openings\nopen_files = Openings(print)\nos.kill(os.getpid(), 9)"
     )
-    subprocess.run([sys.executable, "-c", script], env={**os.environ, "TMPDIR": str(tmp_path)}, check=False, timeout=60)
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", script], env=environment, check=False, timeout=PATIENCE)
     (left,) = tmp_path.iterdir()
     running = Openings(print)
     assert not left.exists()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from benchpage import PATIENCE
 from imulab.live.page import contents, curves
 from imulab.live.page.curves import BUCKET, Writer, statistics, view
 from imulab.recording import Recording
@@ -151,7 +152,7 @@ def test_what_cannot_be_read_is_a_sentence(tmp_path, text, reading, said):
     file = tmp_path / "rec.csv"
     file.write_text(text)
     words = [sys.executable, "-m", "imulab.live.page.contents", str(file), str(tmp_path), json.dumps(reading)]
-    ran = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    ran = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert ran.returncode == 2
     assert ran.stderr == ""
     assert said in next(filter(None, (json.loads(line).get("error") for line in ran.stdout.splitlines())))

@@ -23,6 +23,7 @@ from starlette.routing import Route
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from benchpage import PATIENCE
 from imulab.errors import OptionError
 from imulab.live.page import server
 from imulab.live.page.server import Guard, Hub, PagePart, TextLine, inside, receive_file, to_json
@@ -77,12 +78,12 @@ class Running:
         options = {"browser": False, "limit": LIMIT, "tell": lines.put}
         self.thread = threading.Thread(target=server.serve, args=([self.part],), kwargs=options, daemon=True)
         self.thread.start()
-        self.address = lines.get(timeout=10)
+        self.address = lines.get(timeout=PATIENCE)
         self.host, _, rest = self.address.removeprefix("http://").partition("/")
         self.token = rest.removeprefix("?token=")
 
     def ask(self, path: str, method: str = "GET", body: object = None, **headers: str) -> Answer:
-        connection = http.client.HTTPConnection(self.host, timeout=10)
+        connection = http.client.HTTPConnection(self.host, timeout=PATIENCE)
         connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
         answer = connection.getresponse()
         found = Answer(answer.status, {name.lower(): value for name, value in answer.headers.items()}, answer.read())
@@ -95,7 +96,7 @@ class Running:
 
     def socket(self, **headers: str):
         given = {"X-Imulab-Token": self.token} | headers
-        return connect(f"ws://{self.host}/ws", additional_headers=given, open_timeout=10, proxy=None)
+        return connect(f"ws://{self.host}/ws", additional_headers=given, open_timeout=PATIENCE, proxy=None)
 
 
 @pytest.fixture
@@ -103,7 +104,7 @@ def running(tmp_path) -> Iterator[Running]:
     found = Running(tmp_path)
     yield found
     found.part.hub.stop()
-    found.thread.join(10)
+    found.thread.join(PATIENCE)
     assert not found.thread.is_alive()
 
 
@@ -133,18 +134,18 @@ def test_the_address_that_a_browser_is_started_with_opens_once(tmp_path, monkeyp
     options = {"limit": LIMIT, "tell": lines.put}
     thread = threading.Thread(target=server.serve, args=([part],), kwargs=options, daemon=True)
     thread.start()
-    address, words = lines.get(timeout=10), opened.get(timeout=10)
+    address, words = lines.get(timeout=PATIENCE), opened.get(timeout=PATIENCE)
     host, _, rest = words.removeprefix("http://").partition("/")
     assert address.partition("token=")[2] not in words
     found = []
     for _ in range(2):
-        connection = http.client.HTTPConnection(host, timeout=10)
+        connection = http.client.HTTPConnection(host, timeout=PATIENCE)
         connection.request("GET", f"/{rest}")
         found.append(connection.getresponse().status)
         connection.close()
     assert found == [303, 403]
     part.hub.stop()
-    thread.join(10)
+    thread.join(PATIENCE)
 
 
 @pytest.mark.parametrize(("listened", "host", "status"), [
@@ -211,7 +212,7 @@ def test_another_page_is_refused_though_it_has_the_token(running, headers, statu
 def test_the_socket_is_behind_the_same_guard(running):
     for headers in ({"X-Imulab-Token": "wrong"}, {"Origin": "http://evil.example"}):
         with pytest.raises((InvalidStatus, ConnectionClosed)), running.socket(**headers) as page:
-            page.recv(timeout=60)
+            page.recv(timeout=PATIENCE)
 
 
 def test_static_files_come_with_their_kind_and_from_their_folder_alone(running):
@@ -237,12 +238,12 @@ def test_no_script_of_the_page_looks_behind_which_older_safaris_do_not_read():
 def test_messages_reach_the_part_and_every_page(running):
     with running.socket() as one, running.socket(Origin=f"http://{running.host}") as other:
         for page in (one, other):
-            assert json.loads(page.recv(timeout=60)) == {
+            assert json.loads(page.recv(timeout=PATIENCE)) == {
                 "type": "hello", "areas": ["workbench"], "version": server.VERSION,
             }  # fmt: skip
-            assert json.loads(page.recv(timeout=60)) == {"type": "welcome"}
+            assert json.loads(page.recv(timeout=PATIENCE)) == {"type": "welcome"}
         one.send('{"type": "say", "text": "<b>µ</b>"}')
-        assert [json.loads(page.recv(timeout=60))["text"] for page in (one, other)] == ["<b>µ</b>"] * 2
+        assert [json.loads(page.recv(timeout=PATIENCE))["text"] for page in (one, other)] == ["<b>µ</b>"] * 2
 
 
 @pytest.mark.parametrize(
@@ -258,13 +259,13 @@ def test_messages_reach_the_part_and_every_page(running):
 )
 def test_a_message_that_cannot_be_done_is_answered_by_a_sentence(running, text, said):
     with running.socket() as page:
-        page.recv(timeout=60), page.recv(timeout=60)
+        page.recv(timeout=PATIENCE), page.recv(timeout=PATIENCE)
         page.send(text)
-        answer = json.loads(page.recv(timeout=60))
+        answer = json.loads(page.recv(timeout=PATIENCE))
         assert answer["type"] == "refused"
         assert said in answer["text"]
         page.send('{"type": "say", "text": "still there"}')
-        assert json.loads(page.recv(timeout=60))["text"] == "still there"
+        assert json.loads(page.recv(timeout=PATIENCE))["text"] == "still there"
 
 
 def test_an_upload_lands_in_the_folder_within_the_limit(running, tmp_path):
@@ -307,7 +308,7 @@ def test_numbers_that_are_none_are_null():
 def test_a_page_for_others_tells_an_address_that_they_reach():
     listening = server._listen(0, "0.0.0.0")
     address = server._address_for_others("0.0.0.0"), listening.getsockname()[1]
-    with socket.create_connection(address, timeout=60):
+    with socket.create_connection(address, timeout=PATIENCE):
         pass
     listening.close()
     assert server._address_for_others("10.1.2.3") == "10.1.2.3"
@@ -323,7 +324,7 @@ def test_a_page_listens_at_addresses_of_version_six(host):
         pytest.skip("this machine has no IPv6")
     address = server._address_for_others(host)
     assert address[0] + address[-1] == "[]"
-    with socket.create_connection((address[1:-1], listening.getsockname()[1]), timeout=60):
+    with socket.create_connection((address[1:-1], listening.getsockname()[1]), timeout=PATIENCE):
         pass
     listening.close()
 
@@ -337,13 +338,13 @@ def test_a_port_that_is_taken_is_one_sentence():
 
 
 def test_half_requests_are_closed_and_whole_ones_are_not(running, monkeypatch):
-    monkeypatch.setattr(server, "_HEAD", 0.4)
-    monkeypatch.setattr(server, "_STALLED", 0.4)
+    monkeypatch.setattr(server, "_HEAD", 2.0)
+    monkeypatch.setattr(server, "_STALLED", 2.0)
     host, _, port = running.host.partition(":")
     begun = f"GET / HTTP/1.1\r\nHost: {running.host}\r\n"
     body = f"PUT /api/files/half HTTP/1.1\r\nHost: {running.host}\r\nX-Imulab-Token: {running.token}\r\n"
     halves = ["", "GET", begun, f"{begun}\r\n{begun}", f"{body}Content-Length: 100\r\n\r\nsome"]
-    links = [socket.create_connection((host, int(port)), timeout=60) for _ in halves]
+    links = [socket.create_connection((host, int(port)), timeout=PATIENCE) for _ in halves]
     with running.socket() as page:  # a page that says nothing stays
         for link, half in zip(links, halves, strict=True):
             link.sendall(half.encode())
@@ -352,7 +353,7 @@ def test_half_requests_are_closed_and_whole_ones_are_not(running, monkeypatch):
                 pass
             link.close()
         page.send('{"type": "say", "text": "still here"}')
-        while "still here" not in page.recv(timeout=60):
+        while "still here" not in page.recv(timeout=PATIENCE):
             pass
     assert running.ask("/", **running.key).status == 200
     assert not (running.part.folder / "half").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from datetime import date
 from io import StringIO
@@ -274,6 +275,15 @@ def test_the_view_is_drawn_in_every_state():
     text = console.export_text()
     assert "misalignment yx zx zy" in text
     assert "enough: five more would bring" in text
+
+
+def test_what_five_more_attitudes_would_bring_is_of_the_order_that_is_fitted():
+    """Attitudes are planned for order 3, which has a parameter more than 14 attitudes."""
+    recording = il.simulate_tumble(attitudes=14, order=1, gravity=9.81, hold="3 s", move="1 s", gyro=False)
+    session = Session(order="auto", planned=14)
+    session.feed(recording)
+    now, then = map(float, re.findall(r"[\d.]+", session.view().enough))
+    assert 0.5 * now < then < now
 
 
 def test_what_a_higher_order_explains_is_no_knocked_attitude():

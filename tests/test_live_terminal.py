@@ -20,6 +20,7 @@ import pytest
 from rich.console import Console
 
 import imulab as il
+from benchpage import PATIENCE
 from imulab.live.guide import read_targets
 from imulab.live.session import Session
 from imulab.live.terminal import direction_of_key, draw
@@ -106,7 +107,7 @@ class Screen:
         )  # fmt: skip
         os.close(inner)
 
-    def until(self, what: str, seconds: float = 180.0) -> bool:
+    def until(self, what: str, seconds: float = PATIENCE) -> bool:
         end = time.monotonic() + seconds
         while what not in self.text and time.monotonic() < end:
             if select.select([self.end], [], [], 0.1)[0]:
@@ -116,7 +117,7 @@ class Screen:
                     break
         return what in self.text
 
-    def shows(self, what: str, seconds: float = 180.0) -> bool:
+    def shows(self, what: str, seconds: float = PATIENCE) -> bool:
         """Whether a text comes, whatever its style."""
         end = time.monotonic() + seconds
         while what not in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.text) and time.monotonic() < end:
@@ -127,7 +128,7 @@ class Screen:
         self.text = ""
         os.write(self.end, key.encode())
 
-    def ended(self, seconds: float = 180.0) -> int:
+    def ended(self, seconds: float = PATIENCE) -> int:
         end = time.monotonic() + seconds
         while self.process.poll() is None and time.monotonic() < end:
             self.until("\0", 0.1)  # what nobody reads would hold the process up

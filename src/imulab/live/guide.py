@@ -489,7 +489,7 @@ class Guide:
         if self.fit is None:
             return ""
         there = self.directions()
-        search = Search(self.model_order, "A", there)
+        search = Search(model_of(self.fit.calibration).order, "A", there)  # of the fit whose bias this is
         more = self._planned(_FIVE, there)
         now, then = (np.sqrt(np.diag(search.covariance(each))[:3].max()) for each in (np.empty((0, 3)), more))
         worst = max(u for axis in "xyz" if (u := self.fit.calibration.parameters[f"bias_{axis}"].standard_uncertainty))

@@ -364,7 +364,13 @@ function summary({ head, done, attitudes, turned }) {
 
 // A record, and other files
 
-const start = (command, values) => askOnce("jobs", { command, values }).then(job => { if (!cards.has(job.number)) worked(job); }); // else a message was first
+// What is started here is shown at once, and its settings fold away.
+const start = (command, values) => askOnce("jobs", { command, values }).then(job => {
+  if (!cards.has(job.number)) worked(job); // else a message was first
+  const settings = ui.form.querySelector("details.settings");
+  if (settings?.querySelector("summary").textContent === job.path) settings.open = false;
+  cards.get(job.number)?.element.scrollIntoView({ block: "start" }); // it may have been cleared by now
+});
 const targets = () => (forms.find(each => each.path === "export")?.fields.find(each => each.name === "to")?.choices || []).filter(each => each !== "c");
 
 function record() {
@@ -545,11 +551,6 @@ function worked(job) {
     found.element.files = job.words;
     ui.jobs.prepend(found.element);
     show(ui.clear, true);
-    if (Date.now() / 1000 - job.began < 5) {
-      const settings = ui.form.querySelector("details.settings");
-      if (settings && settings.querySelector("summary").textContent === job.path) settings.open = false;
-      found.element.scrollIntoView({ block: "start" });
-    }
   }
   if (!latestJob || job.number >= latestJob.number) tell(job);
   if (job.ended !== null && !chosen) {

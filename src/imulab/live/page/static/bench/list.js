@@ -21,6 +21,7 @@ export function fileList(act) {
   const list = h("ul", { class: "list" });
   const place = h("nav", { "aria-label": "Files" }, list);
   const open = new Set();
+  let current = null;
 
   function row(each, chosen, others) {
     const id = `file-${each.name}`;
@@ -55,6 +56,12 @@ export function fileList(act) {
       const drawn = redraw(list, files.filter(each => !each.folder).flatMap(each => (each.kind === "folder"
         ? folder(each, files.filter(one => one.folder === each.name), chosen, others) : [row(each, chosen, others)])));
       show(place, files.length > 0);
+      if (chosen !== current) {  // by a reload or "Look at", it may lie below what the list shows on a small screen
+        current = chosen;
+        const row = list.querySelector("[aria-current]")?.closest("li");
+        const top = row ? row.offsetTop - place.offsetTop : 0;
+        if (row) place.scrollTop = Math.min(top, Math.max(place.scrollTop, top + row.offsetHeight - place.clientHeight));
+      }
       if (drawn && focused) [...list.querySelectorAll(`[data-${kind}]`)].find(each => each.dataset[kind] === focused)?.focus();
     },
   };
