@@ -359,6 +359,14 @@ def test_only_what_a_file_is_for_is_offered_and_of_the_rest_it_is_said_why(workb
     assert "noise fit" not in cards
 
 
+def test_of_gyroscopes_at_rest_the_noise_is_offered_first(workbench, new_page, folder):
+    il.write_csv(il.simulate_noise(white="0.3 deg/sqrt(h)", flicker="5 deg/h", duration="60 s"), "rest.csv")
+    page = new_page(workbench.address)
+    drop(page, "rest.csv", Path("rest.csv").read_text())
+    page.locator("[data-path='noise fit'][aria-pressed='true']").wait_for()
+    assert offered(page)[:2] == ["noise fit", "rate fit"]
+
+
 def test_what_was_said_of_one_file_s_columns_is_not_said_of_the_next(workbench, new_page):
     page = new_page(workbench.address)
     text = tumble("own.csv")

@@ -128,9 +128,10 @@ def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
     from imulab.procedures.tumble.attitudes import find_attitudes
 
     names = triad("accel")
-    if not head.timed or not set(names) <= set(head.units):
-        return {"attitudes": []}
     numbers = {each: number for number, each in enumerate(head.units)}
+    if not head.timed or not set(names) <= set(head.units):
+        rates = (_all(folder / f"{number}.values", head.rows) for each, number in numbers.items() if "gyro" in each)
+        return {"attitudes": [], "turned": any(_changes(each, head.usual) for each in rates)}
     columns = {each: _all(folder / f"{numbers[each]}.values", head.rows) for each in names}
     columns["time"] = _all(folder / "time.values", head.rows)
     units = {**{each: head.units[each] for each in names}, "time": "s"}
@@ -141,6 +142,13 @@ def attitudes(folder: Path, head: Head, name: str) -> dict[str, Any]:
     up = known.mean / np.maximum(np.linalg.norm(known.mean, axis=1, keepdims=True), 1e-300)
     ends = zip(known.start.tolist(), known.stop.tolist(), strict=True)
     return {"attitudes": [list(each) for each in ends], "turned": bool((up @ up[0] < math.cos(_TURNED)).any())}
+
+
+def _changes(rate: Array, step: float) -> bool:
+    """Whether means over a second spread by half as much as the samples: noise at rest averages out."""
+    length = max(round(1 / step), 1) if step > 0 else 1
+    means = rate[: len(rate) // length * length].reshape(-1, length).mean(axis=1)
+    return not np.std(means) < 0.5 * np.std(rate)
 
 
 def _all(path: Path, count: int) -> Array:

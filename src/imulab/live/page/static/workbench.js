@@ -408,7 +408,7 @@ function simulate() {
 function facts() {
   return {
     kind: chosen.kind, procedure: chosen.procedure, count: 1 + others.length, known: Boolean(opening?.head?.rows),
-    columns: Object.keys(opening?.head?.units || {}), timed: Boolean(opening?.head?.timed), attitudes: opening?.attitudes ? opening.attitudes.length : null,
+    columns: Object.keys(opening?.head?.units || {}), timed: Boolean(opening?.head?.timed), attitudes: opening?.attitudes ? opening.attitudes.length : null, turned: opening?.turned,
     records: files.filter(each => each.kind === "record").map(each => each.procedure),
   };
 }
@@ -482,7 +482,11 @@ function fill(definition, given = {}) {
     values[each.name] = each.kind === "files" ? fitting : fitting[0];
   }
   current = form(definition, {
-    files: () => files, values, keep: typed => keep("values", key, typed),
+    files: () => files, values,
+    keep: typed => {
+      keep("values", key, typed);
+      if (!procedure && Object.keys(typed).length) noted(definition, false); // no likelier one takes its place
+    },
     run: async typed => {
       if (filled === formKey(definition)) noted(definition, false); // another file may be shown by now
       await start(definition.path, typed);

@@ -68,6 +68,7 @@ export function likely(one, other, facts) {
     if (LATER.includes(path)) return 90;
     if (path === "warmup fit" && facts.count > 1) return 0;
     if (path === "magnetometer fit" && has(facts, "mag") && !has(facts, "accel")) return 0;
+    if (path === "noise fit" && facts.turned === false && !has(facts, "accel")) return 5;
     if (path.startsWith("array") && some(facts, ELEMENTS)) {
       const board = !imus(facts) && path.endsWith("--imus");
       return (path.includes("calibrate") ? 2 : 5) - (board ? 1 : 0);
