@@ -145,6 +145,15 @@ def test_what_is_refused_is_said_where_it_was_typed(workbench, new_page):
     page.wait_for_function("() => !document.querySelector('.wrong:not([hidden])')")
 
 
+def test_settings_that_are_refused_are_open_to_be_mended(workbench, new_page, folder):
+    page = new_page(workbench.address)
+    drop(page, "gyro.csv", gyro_log("own.csv"))
+    page.locator("[data-path='rate fit'][aria-pressed='true']").wait_for()
+    run(page)
+    page.locator(".job .chip.refused").wait_for()
+    page.locator(".settings[open]").get_by_label("rates", exact=True).wait_for()
+
+
 def test_results_name_their_file_say_that_it_was_replaced_and_are_cleared(workbench, new_page):
     page = new_page(workbench.address)
     drop(page, "rec.csv", tumble("own.csv"))

@@ -364,12 +364,18 @@ function summary({ head, done, attitudes, turned }) {
 
 // A record, and other files
 
-// What is started here is shown at once, and its settings fold away.
+// Folds the settings of a command, or opens them again.
+function fold(path, away) {
+  const settings = ui.form.querySelector("details.settings");
+  if (settings?.querySelector("summary").textContent === path) settings.open = !away;
+}
+
+// What is started here is shown at once, and its settings fold away, unless it has been refused by now.
 const start = (command, values) => askOnce("jobs", { command, values }).then(job => {
   if (!cards.has(job.number)) worked(job); // else a message was first
-  const settings = ui.form.querySelector("details.settings");
-  if (settings?.querySelector("summary").textContent === job.path) settings.open = false;
-  cards.get(job.number)?.element.scrollIntoView({ block: "start" }); // it may have been cleared by now
+  const started = cards.get(job.number);
+  fold(job.path, !started?.failed());
+  started?.element.scrollIntoView({ block: "start" }); // it may have been cleared by now
 });
 const targets = () => (forms.find(each => each.path === "export")?.fields.find(each => each.name === "to")?.choices || []).filter(each => each !== "c");
 
@@ -556,6 +562,7 @@ function worked(job) {
     ui.jobs.prepend(found.element);
     show(ui.clear, true);
   }
+  if (cards.get(job.number).failed()) fold(job.path, false); // to be mended there
   if (!latestJob || job.number >= latestJob.number) tell(job);
   if (job.ended !== null && !chosen) {
     const made = job.outputs.find(name => files.some(each => each.name === name && ["recording", "folder"].includes(each.kind)));

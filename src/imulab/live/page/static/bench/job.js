@@ -106,5 +106,5 @@ export function card(job, act) {
   show(text, false);
   update(job);
   tick();
-  return { element, update, open: () => now.ended === null };
+  return { element, update, open: () => now.ended === null, failed: () => ["refused", "cancelled"].includes(now.state) };
 }
