@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import imulab as il
+from benchpage import PATIENCE
 from conftest import REPOSITORY, table
 from imulab.errors import RecordError
 from imulab.procedures.views import exhibits_of, render_record
@@ -37,8 +38,17 @@ def browse(chromium, tmp_path, page, *options):
             "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={tmp_path / 'profile'}",
             "--window-size=1100,3600", "--virtual-time-budget=15000", *options, page.as_uri(),
         ],
-        capture_output=True, text=True, timeout=120, check=True,
+        capture_output=True, text=True, timeout=PATIENCE, check=True,
     ).stdout  # fmt: skip
+
+
+def opened(browser, path, width, **options):
+    """A report in a browser, once its figures are drawn."""
+    page = browser.new_page(viewport={"width": width, "height": 900}, **options)
+    page.set_default_timeout(1000 * PATIENCE)
+    page.goto(path.as_uri())
+    page.wait_for_selector("html[data-drawn]", state="attached")
+    return page
 
 
 @pytest.mark.slow
@@ -200,7 +210,7 @@ def test_a_knocked_attitude_stands_at_the_edge_of_the_residuals_with_its_value(r
 
 @pytest.mark.parametrize(("widths", "dark"), [((390, 768, 1280), False), ((390,), True)])
 @pytest.mark.slow
-def test_nothing_overflows_sideways(record, chromium, tmp_path, widths, dark):
+def test_nothing_overflows_sideways(record, browser, tmp_path, widths, dark):
     side = {f"xaxis{k}": {"domain": d, "anchor": f"y{k}"} for k, d in (("", [0, 0.45]), ("2", [0.55, 1]))}
     side |= {"yaxis": {"domain": [0, 1]}, "yaxis2": {"domain": [0, 1], "anchor": "x2"}}
     exhibits = exhibits_of(record)
@@ -209,23 +219,19 @@ def test_nothing_overflows_sideways(record, chromium, tmp_path, widths, dark):
     (tmp_path / "r.html").write_text(
         render_page("T", "S" * 60, replace(exhibits, items=[*exhibits.items, pair, wide])), encoding="utf-8"
     )
-    frame = tmp_path / "frame.html"
-    frame.write_text(
-        "".join(f"<iframe src=r.html style='border:0;width:{width}px;height:900px'></iframe>" for width in widths)
-        + "<p id=found></p><script>addEventListener('load', () => setTimeout(() => {"
-        "found.textContent = [...document.querySelectorAll('iframe')].map(frame => {"
-        "const page = frame.contentDocument;"
-        "const plots = [...page.querySelectorAll('svg.main-svg')].map(plot => plot.getBoundingClientRect().right);"
-        "return [page.documentElement.scrollWidth, Math.max(...plots), getComputedStyle(page.body).backgroundColor]"
-        ".join(' ') }).join(';') }, 4000))</script>"
-    )
-    options = ["--allow-file-access-from-files", *(["--blink-settings=preferredColorScheme=0"] if dark else [])]
-    said = re.search(r'id="found">([^<]+)<', browse(chromium, tmp_path, frame, "--dump-dom", *options))[1].split(";")
-    for width, found in zip(widths, said, strict=True):
-        scroll, right, background = re.fullmatch(r"(\d+) ([\d.]+) (rgb.+)", found).groups()
-        assert int(scroll) <= width
-        assert width / 2 < float(right) <= width
+    for width in widths:
+        page = opened(browser, tmp_path / "r.html", width, color_scheme="dark" if dark else "light")
+        page.wait_for_function(
+            """width => {
+            const right = Math.max(...[...document.querySelectorAll('svg.main-svg')]
+                .map(plot => plot.getBoundingClientRect().right));
+            return document.documentElement.scrollWidth <= width && width / 2 < right && right <= width;
+        }""",
+            arg=width,
+        )
+        background = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (background == "rgb(17, 23, 27)") == dark
+        page.close()
 
 
 def test_panels_side_by_side_go_beneath_one_another_on_a_phone():
@@ -245,21 +251,19 @@ def test_panels_side_by_side_go_beneath_one_another_on_a_phone():
     assert narrow(Figure("", "", [], {"xaxis": {}, "yaxis": {}})) is None
 
 
-def test_a_table_wider_than_its_card_says_that_it_scrolls(record, chromium, tmp_path):
+def test_a_table_wider_than_its_card_says_that_it_scrolls(record, browser, tmp_path):
     wide = ReportTable("Wide", "", [f"title {n}" for n in range(7)], [["0.123456789"] * 7])
     small = ReportTable("Small", "", ["a", "b"], [["1", "2"]])
-    page = render_page("T", "S", replace(exhibits_of(record), items=[wide, small]))
-    (tmp_path / "r.html").write_text(page, encoding="utf-8")
-    frame = tmp_path / "frame.html"
-    frame.write_text(
-        "".join(f"<iframe src=r.html style='border:0;width:{width}px;height:900px'></iframe>" for width in (390, 1280))
-        + "<p id=found></p><script>addEventListener('load', () => setTimeout(() => {"
-        "found.textContent = [...document.querySelectorAll('iframe')].map(frame => "
-        "[...frame.contentDocument.querySelectorAll('.sideways')].map(hint => getComputedStyle(hint).display).join(' ')"
-        ").join(';') }, 2000))</script>"
-    )
-    found = browse(chromium, tmp_path, frame, "--dump-dom", "--allow-file-access-from-files")
-    assert re.search(r'id="found">([^<]+)<', found)[1] == "block none;none none"
+    text = render_page("T", "S", replace(exhibits_of(record), items=[wide, small]))
+    (tmp_path / "r.html").write_text(text, encoding="utf-8")
+    for width, displays in ((390, "block none"), (1280, "none none")):
+        page = opened(browser, tmp_path / "r.html", width)
+        page.wait_for_function(
+            """displays => displays === [...document.querySelectorAll('.sideways')]
+            .map(hint => getComputedStyle(hint).display).join(' ')""",
+            arg=displays,
+        )
+        page.close()
 
 
 @pytest.mark.slow
@@ -270,8 +274,7 @@ def test_tiles_break_no_word_and_units_stay_in_view(browser, tmp_path):
     wide = ReportTable("Wide", "", columns, [["mag_misalignment_xy", "-92.168", "0.095", "-92.354 to -91.982", "mrad"]])
     (tmp_path / "r.html").write_text(render_page("T", "S", Exhibits("", facts, [wide])), encoding="utf-8")
     for width in (390, 768, 1280):
-        page = browser.new_page(viewport={"width": width, "height": 900})
-        page.goto((tmp_path / "r.html").as_uri())
+        page = opened(browser, tmp_path / "r.html", width)
         lines = page.evaluate(
             """() => [...document.querySelectorAll('.facts dd')].flatMap(({ firstChild }) =>
             [...firstChild.data.matchAll(/\\S+/g)].map(word => {
@@ -330,8 +333,7 @@ def test_a_print_hides_buttons_and_is_a4(record, chromium, tmp_path):
 @pytest.mark.parametrize("width", [390, 768, 1280])
 def test_no_cell_of_a_table_of_parameters_lies_over_another(record, browser, tmp_path, width):
     (tmp_path / "r.html").write_text(render_record(record), encoding="utf-8")
-    page = browser.new_page(viewport={"width": width, "height": 900})
-    page.goto((tmp_path / "r.html").as_uri())
+    page = opened(browser, tmp_path / "r.html", width)
     cells = page.evaluate(
         """() => [...document.querySelector('table').tBodies[0].rows].map(row =>
         [...row.cells].map(cell => cell.getBoundingClientRect()).map(box => [box.left, box.right]))"""
