@@ -120,7 +120,7 @@ def test_limit_and_level_agree(name):
         (("rate turn",), 0.0148),
         (("rate prior",), 0.0100),
         (("centrifuge",), 0.0362),
-        (("noise",), 0.0299),
+        (("noise",), 0.0319),
         (("noise check",), 0.0500),
         (("gyro_array",), 0.0209),
         (("warmup",), 0.0045),

@@ -283,6 +283,17 @@ LEVEL_STEP = Decision(
 LEVEL_STEP_PERHAPS = Decision(
     6.3e-5, "model", {"noise": 6000}, "a step is taken out before it is tested again, by noise without it", limit=4.0
 )
+NOISE_CHANGES_SIZE = Decision(
+    5.7e-7, "verdict", {"noise": 360}, "the noise is louder from some time on: six columns, sixty places of each",
+    limit=5.0,
+)  # fmt: skip
+SENSOR_WARMS_UP = Decision(
+    3e-4, "verdict", {"noise": 6}, "a column drifts as while warming up, which its slow noise does not make"
+)
+WARM_UP_PERHAPS = Decision(
+    6.3e-5, "model", {"noise": 84}, "a drift of warming up is taken out before it is judged",
+    limit=4.0,
+)  # fmt: skip
 FOLLOWS_COVARIATE = Decision(
     0.00137, "verdict", {"noise": 12}, "a column follows the time or the temperature", limit=3.2
 )

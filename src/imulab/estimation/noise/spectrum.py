@@ -8,7 +8,7 @@ the memory needed does not grow with the log.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,8 @@ _MEANS = 1 << 21
 _SHARE = 32
 """Only the lowest 32nd of the means' frequencies is used, where averaging takes at most 0.08 % from slow noise."""
 SLOW = 1 << 19  # lowest coefficients that are kept one by one, for steps and covariates
+_PARTS, _LEAST_PART, _LONG_PART = 64, 50, STRETCH // 4
+"""Parts whose loudness is told, fewest samples of a part, and samples of a part of a longer log than a whole."""
 _FINE = 1 << 10  # angles of the finer of the two tables whose products give all sines
 
 
@@ -115,6 +117,8 @@ class Stretch:
         Number of samples that were replaced.
     knocks
         Start and length, s, of each part that was replaced because it differs from the noise around it.
+    loudness
+        Mean square of the steps from sample to sample in equal parts of the stretch, shape (p,).
     """
 
     spectra: tuple[Spectrum, ...]
@@ -123,6 +127,7 @@ class Stretch:
     lines: tuple[Line, ...]
     spikes: int
     knocks: tuple[tuple[float, float], ...] = ()
+    loudness: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def count(self) -> int:
@@ -229,6 +234,7 @@ class Accumulator:
         self._held = self._spikes = self._stretches = 0
         self._squares, self._turns = np.zeros(1), np.empty(0, dtype=np.complex128)
         self._knocks: list[NDArray[np.int64]] = []
+        self._loudness = np.empty(0)
         self._means, self._filled, self._averaged = np.empty(0), 0, 1
 
     def add(self, samples: Array) -> None:
@@ -280,6 +286,9 @@ class Accumulator:
         self._knocks.append(knocks + self._stretches * STRETCH)
         samples, count = spikes_removed(without, ordered if without is samples else ordered_blocks(without))
         self._spikes += count
+        part = _LONG_PART if self._long else max(len(samples) // _PARTS, _LEAST_PART)
+        parts = np.diff(samples[: len(samples) // part * part].reshape(-1, part), axis=1)
+        self._loudness = np.concatenate([self._loudness, np.einsum("pi,pi->p", parts, parts) / (part - 1)])
         return samples
 
     def _knocked(self) -> tuple[tuple[float, float], ...]:
@@ -299,7 +308,7 @@ class Accumulator:
             fine, weak = line_groups(squares, first, last, 1, count, self._interval)
             lines = tuple(sorted([*strong, *weak], key=lambda line: -line.amplitude))
         spectrum = binned(squares, fine, (first, last), self._interval, count)
-        return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes, self._knocked())
+        return Stretch((spectrum,), c[:SLOW].copy(), fine[:SLOW], lines, self._spikes, self._knocked(), self._loudness)
 
     def _transform(self, samples: Array) -> Array:
         """Add the squares of all whole stretches, some at a time; return the rest."""
@@ -360,7 +369,7 @@ class Accumulator:
         edge = above.first[0] / (2 * STRETCH * self._interval)
         named = [*lines, *(each for each in more if each.frequency >= edge)]
         lines = tuple(sorted(named, key=lambda line: -line.amplitude))
-        return Stretch(tuple(parts), slow, fine, lines, self._spikes, self._knocked())
+        return Stretch(tuple(parts), slow, fine, lines, self._spikes, self._knocked(), self._loudness)
 
 
 def binned(

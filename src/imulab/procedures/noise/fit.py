@@ -6,6 +6,7 @@ them, `analysis` chooses among models and tests the fit, `terms` gives white noi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -21,7 +22,6 @@ from imulab.columns import kind_of
 from imulab.display import Finding, Note, join_alike, prefixed
 from imulab.errors import DataError, OptionError, RecordError, UnitError, listed, several
 from imulab.estimation.column_noise import noise_columns
-from imulab.estimation.decisions import LEVEL_STEP_PERHAPS
 from imulab.estimation.distributions import probability_text
 from imulab.estimation.noise.analysis import (
     CANDIDATES,
@@ -33,6 +33,7 @@ from imulab.estimation.noise.analysis import (
     ramp_coefficients,
     without_steps,
 )
+from imulab.estimation.noise.changes import WarmUp, changes_of_level, loudness_change, warm_up
 from imulab.estimation.noise.cleaning import LevelChange, Line
 from imulab.estimation.noise.likelihood import Flags
 from imulab.estimation.noise.rest import Rest, at_rest, long_rest
@@ -121,6 +122,8 @@ class ColumnModel:
         What is not noise; of knocks start and length, s.
     drifts
         Dependence on time and temperature.
+    warming
+        Drift of a sensor that warms up.
     """
 
     name: str
@@ -131,6 +134,7 @@ class ColumnModel:
     lines: tuple[Line, ...]
     steps: tuple[LevelChange, ...]
     drifts: tuple[CovariateDrift, ...]
+    warming: WarmUp | None = None
 
 
 # Logs: short ones as recordings, large files block by block or with columns on disk.
@@ -196,7 +200,10 @@ _SLOW_FACTOR, _LEANS = 10.0, 0.005
 def findings(columns: Mapping[str, ColumnModel], rests: Sequence[Rest], horizon: float) -> tuple[str, ...]:
     """Return the findings on all columns; columns with the same finding share a sentence."""
     on_columns: list[tuple[str, str]] = []
+    warm_from = max((column.warming.lasts for column in columns.values() if column.warming), default=0.0)
     for name, column in columns.items():
+        if column.warming:
+            on_columns.append((name, _describe_warming(column.warming, column, warm_from)))
         if rejected(p := column.analysis.test.probability, len(columns)):
             text = f"no model of these terms fits ({probability_text(p)}); the numbers tell the size of the noise alone"
             on_columns.append((name, Finding(text, "take the white noise alone, or fit a quieter part (--window)")))
@@ -248,6 +255,12 @@ def _describe_column(column: ColumnModel) -> list[str]:
         text = f"{many} unlike the noise around, {lost:.2g} s from {start:.5g} s on, bridged by straight lines"
         kind = Finding if lost > _MANY_SPIKES * samples * analysis.interval else Note
         messages.append(kind(text, "let the unit rest undisturbed, and record again"))
+    if change := loudness_change(_longest(analysis.stretches)):
+        text = (
+            f"noise is {change.factor:.3g} times as loud from {change.time:.3g} s on; the model is a mean of both parts"
+        )
+        action = "fit both parts apart (--window), or record again at one temperature, fans and motors as in use"
+        messages.append(Finding(text, action))
     if column.lines:
         messages.append(Note(_describe_lines(column)))
     for low, high, factor in analysis.allowance.off[:_MOST_NAMED]:
@@ -267,6 +280,18 @@ def _describe_column(column: ColumnModel) -> list[str]:
     if rivals:
         messages.append(Note(f"{chosen} and {', '.join(rivals)} describe the record about equally well"))
     return messages
+
+
+def _describe_warming(warming: WarmUp, column: ColumnModel, warm_from: float) -> Finding:
+    """Return the sentence about a sensor that warms up, and what to leave out, all columns being warm from then on."""
+    text = (
+        f"drifts by {_sized(-warming.size, column.unit)} as while warming up, with a time constant of "
+        f"{warming.time:.3g} s; the model takes that for slow noise"
+    )
+    start = 10 * math.ceil(warm_from / 10)
+    if start > column.analysis.length / 2:
+        return Finding(text, "record again once the sensor is warm")
+    return Finding(text, f"leave out the first {start} s (--window +{start}:), or fit the warm-up (imulab warmup fit)")
 
 
 def _describe_edge(column: ColumnModel) -> str:
@@ -613,12 +638,6 @@ def _numbers(values: Array) -> list[float]:
 
 
 _SAME_RATE = 0.01  # relative: logs of other rates have no common spectrum
-_FEW_STEPS, _STEP_PRICE, _WITHOUT_SLOW = 2, 14.0, ("N", "NQ")
-"""Most steps that are taken for what looks like slow noise; what each must gain over it, for its size and the choice of
-its place among a hundred; models that have no slow noise."""
-_BESIDE_SLOW = 25.0
-"""What each step must gain where slow noise is left: steps said of 60 logs with random walk gained 24 and 27, those of
-ten logs with a step of nine times the 1/f noise 26 to 43."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -895,16 +914,17 @@ def _fit_column(
 ) -> ColumnModel:
     stretches = analysis.stretches
     spikes, lines = sum(each.spikes for each in stretches), _longest(stretches).lines
-    steps = _steps_for_slow_noise(stretches, analysis, candidates)
-    perhaps = [] if steps else analysis.steps(stretches, LEVEL_STEP_PERHAPS.limit)
-    if any(perhaps):  # with the steps in the data, the model takes some of them for random walk
-        after = analysed(cleaned := without_steps(stretches, perhaps), candidates, band)
-        gain = after.cost(stretches, analysis.model) - after.cost(cleaned, after.model)
-        steps = after.steps(stretches) if gain > _BESIDE_SLOW * sum(map(len, perhaps)) else steps
+    covariates = _covariates(temperatures, stretches)
+    starts = [not number for rest in rests for number in range(len(rest.parts))]
+    warming = None if regress else warm_up(analysis, starts, list(covariates.values()), candidates)
+    rested = warming.left if warming else analysis
+    steps = changes_of_level(rested.stretches, rested, candidates, band)
     if flat and any(steps):
         analysis = analysed(without_steps(stretches, steps), candidates, band)
     drifts = []
-    for covariate, slow in _covariates(temperatures, analysis.stretches).items():
+    for covariate, slow in covariates.items():
+        if warming and covariate == "time":
+            continue
         hidden = [each for rest in rests for each in rest.hidden(covariate)] if covariate == "temperature" else []
         regression = analysis.regressed(slow, hidden)
         taken, left = covariate == regress, analysis.letters
@@ -925,29 +945,8 @@ def _fit_column(
         lines,
         tuple(step for each in steps for step in each),
         tuple(drifts),
+        warming,
     )
-
-
-def _steps_for_slow_noise(
-    stretches: Sequence[Stretch], analysis: Analysis, candidates: tuple[str, ...]
-) -> list[tuple[LevelChange, ...]]:
-    """Return the changes of level without which a column has no slow noise, where they explain it better.
-
-    Under a model with random walk a step is lost among its steps, so that it is looked for under white noise alone.
-    """
-    if candidates != CANDIDATES or analysis.letters in _WITHOUT_SLOW:
-        return []
-    highest = analysis.band.highest
-    steps = analysed(stretches, ("N",), highest).steps(stretches, LEVEL_STEP_PERHAPS.limit, _FEW_STEPS + 1)
-    count = sum(map(len, steps))
-    if not 0 < count <= _FEW_STEPS:
-        return []
-    cleaned = without_steps(stretches, steps)
-    left = analysed(cleaned, candidates, highest)
-    if left.letters not in _WITHOUT_SLOW:
-        return []
-    gain = left.cost(stretches, analysis.model) - left.cost(cleaned, left.model)
-    return steps if gain > _STEP_PRICE * count else []
 
 
 def _longest(stretches: Sequence[Stretch]) -> Stretch:
