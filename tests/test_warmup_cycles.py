@@ -158,3 +158,21 @@ def test_files_share_their_axes_and_are_given_once(tmp_path):
     read = [find_power_cycle(il.read(tmp_path / "a.csv")) for _ in range(2)]
     with pytest.raises(DataError, match="given twice"):
         common_axes(read)
+
+
+def test_noise_above_the_curve_does_not_make_the_settling_time_the_shortest():
+    """The last bin begins before the latest settling time: no bin was left for the level, and 0/0 made T_M 30 s."""
+    chosen = []
+    for seed in (26, 28, 31):
+        rng = np.random.default_rng(seed)
+        time = np.arange(0, 600, 0.2)
+        cycles = []
+        for temperature in (-20.0, 0.0, 20.0):
+            curve = 0.03 * np.exp(-time / 120)
+            x = curve[:, None] + 0.05 * np.sqrt(5) * rng.standard_normal((len(time), 3))
+            columns = {"time": time} | {f"gyro_{axis}": x[:, i] for i, axis in enumerate("xyz")}
+            units = {"time": "s"} | {f"gyro_{axis}": "deg/s" for axis in "xyz"}
+            head = {"power_on_temperature": f"{temperature:g}"}
+            cycles.append(il.Recording(columns=columns, units=units, metadata=head))
+        chosen.append(il.fit_warmup(cycles, temperatures=(-20.0, 0.0, 20.0), model="knot-cubic").table.settling_time)
+    assert min(chosen) > 30

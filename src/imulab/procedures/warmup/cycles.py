@@ -828,7 +828,7 @@ def _choose_settling_time(
     chosen = 0.75 * shortest
     reached = True
     for _ in range(5):
-        late = edges[:-1] >= min(chosen, latest) - _NEARLY
+        late = edges[:-1] >= min(chosen, latest, edges[-2]) - _NEARLY
         z = curve - (curve[:, late] * weight[:, late]).sum(axis=1, keepdims=True) / weight[:, late].sum(
             axis=1, keepdims=True
         )
