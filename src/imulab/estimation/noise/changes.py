@@ -25,7 +25,7 @@ those of 13 standard uncertainties 22 or more in all of 40. And where it is left
 gained 24 and 27, those of ten logs with a step of nine times the 1/f noise 26 to 43."""
 _SHORTEST, _LONGEST, _TIMES = 0.01, 0.25, 14
 """Shortest and longest time constant of a warm-up that is tried, in lengths of its stretch, and how many are tried."""
-_FEWEST_PARTS, _EITHER_SIDE, _LOUDER = 32, 5, 1.1
+_FEWEST_PARTS, _EITHER_SIDE, _LOUDER = 32, 5, 1.2
 """Fewest parts that tell a change of the noise's size, and fewest before and after it; a lesser change is not told."""
 _COEFFICIENTS = 1 << 12  # lowest coefficients of a warm-up that are used: they fall with the square of the frequency
 
@@ -111,11 +111,11 @@ def warm_up(
     stretches = analysis.stretches
     longest = max(each.count * each.interval for each, is_start in zip(stretches, starts, strict=True) if is_start)
     times = longest * np.geomspace(_SHORTEST, _LONGEST, _TIMES)
-    white = analysed(stretches, ("N",), analysis.band.highest)
+    curves = [_curves(each, times, is_start) for each, is_start in zip(stretches, starts, strict=True)]
+    white = [] if analysis.letters == "N" else [analysed(stretches, ("N",), analysis.band.highest)]
     best = None
     gain_needed = PER_PARAMETER + chi_square_upper_quantile(SENSOR_WARMS_UP.level, 2)
-    for beside in (white, analysis):
-        curves = [_curves(each, times, is_start) for each, is_start in zip(stretches, starts, strict=True)]
+    for beside in (*white, analysis):
         z = np.abs(_scores(beside, curves))
         place = int(np.argmax(z))
         if z[place] < max(WARM_UP_PERHAPS.limit, *(np.abs(_scores(beside, each)).max() for each in others)):
