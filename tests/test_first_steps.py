@@ -302,7 +302,8 @@ def test_what_is_printed_of_a_recording_is_a_line(recording):
     [
         (
             ["tumble", "plan", "--order", "1", "--attitudes", "20", "--noise", "1ug", "--from", "fixtur:15"],
-            "--from 'fixtur:15': expected sphere, fixture:15, head:15 (steps in deg) or a file of directions",
+            "--from 'fixtur:15': expected sphere, fixture:15, head:15 (steps in deg) or a file of directions; did you "
+            "mean 'fixture'?",
         ),
         (
             ["centrifuge", "plan", "--levels", "1,2", "--uncertainty", "5"],

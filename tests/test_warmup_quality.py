@@ -88,6 +88,8 @@ def test_a_time_constant_at_the_limit_of_the_search_is_said_to_be_so():
         cycles = sloping_cycles(slope)
         fit = il.fit_warmup(cycles, temperatures=[-20, 0, 20], settling_time=END, model="exponential")
         said.append(any("s is the longest that is sought, 3 T_M" in message for message in fit.calibration.warnings))
+        longest = [p for p in fit.calibration.parameters.values() if p.value == pytest.approx(3 * END, rel=0.02)]
+        assert all(parameter.standard_uncertainty is None for parameter in longest)  # it was 1 ms
     assert said == [True, False]
 
 
@@ -326,3 +328,35 @@ def test_repeatability_lost_in_the_noise_has_an_uncertainty(reduced):
     assert (uncertainty > 0).all()
     assert 0.3 < (value == 0).mean() < 0.8
     assert (value <= 2 * uncertainty).mean() >= 0.9
+
+
+def logged(law, at, number, seed):
+    """Twenty minutes at 1 Hz of a law of time, deg/s, with white noise of 0.004 deg/s."""
+    time = np.arange(1200.0)
+    rates = law(time)[:, None] * [1.0, -0.7, 0.5] + 0.004 * np.random.default_rng(seed).standard_normal((1200, 3))
+    columns = {"time": time} | {f"gyro_{axis}": rates[:, k] for k, axis in enumerate("xyz")}
+    return Recording(
+        columns,
+        {"time": "s"} | {f"gyro_{axis}": "deg/s" for axis in "xyz"},
+        name=f"{at}-{number}",
+        metadata={"power_on_temperature": str(at)},
+    )
+
+
+@pytest.mark.parametrize(("slope", "state"), [(0.0, "good"), (4e-6, "look")])
+def test_what_still_drifts_settles_later_and_a_drift_that_goes_on_is_said(slope, state):
+    """A slow exponential, 120 s: by its size alone it has settled when a tenth of it is still to come."""
+    temperatures = [-20, 0, 20, 40, 60]
+
+    def law(time):
+        return 0.012 * np.exp(-time / 20) + 0.018 * np.exp(-time / 120) + slope * time
+
+    later = []
+    for seed in range(3):
+        cycles = [logged(law, at, k, [seed, k, at + 20]) for at in temperatures for k in range(3)]
+        record = il.fit_warmup(cycles, temperatures=temperatures).calibration
+        assert record.verdict.state == state
+        later.append(record.value("settling_time"))
+        if state == "good":
+            assert record.value("time_constant_2") == pytest.approx(120, abs=12)
+    assert (max(later) > 300) == (state == "good")

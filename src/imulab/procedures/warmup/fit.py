@@ -5,8 +5,9 @@ Stages: `cycles` averages recordings, `model` fits tables by least squares, `qua
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, TypeAlias, Unpack
 
 import numpy as np
@@ -27,6 +28,7 @@ from imulab.procedures.warmup.quality import (
     judge,
     judge_none,
     repeatability,
+    still_drifting,
     worst_between,
 )
 from imulab.procedures.warmup.record import make_record
@@ -39,6 +41,9 @@ TOLERANCE = 1.0
 """How far a power-on temperature may lie from its calibration temperature, K."""
 SETTLING_SHARE = 0.05
 """Share of the largest |Z| of its kind below which a curve counts as settled."""
+_LATER, _SETTLED_BY, _SLOWED = 1.2, 2 / 3, 0.5
+"""Ratio of a settling time to the one tried before, share of the shortest cycle that it takes at most, and how much
+slower what is left must drift."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -165,14 +170,13 @@ def fit_warmup(
     used = [with_axes(cycle, order) for cycle in used]
     _check_together(used, pool)
     limits = _limits(settling_limit)
-    curves, settled = make_curves(used, at, tolerance=tolerance, settling_time=settling_time, limit=limits)
-    spread = repeatability(curves)
+    made = partial(make_curves, used, at, tolerance=tolerance, limit=limits)
+    curves, settled = made(settling_time=settling_time)
     by_unit = pool == "type" and np.unique(curves.unit).size > 1
-    weights = cycle_weights(curves, spread) if by_unit else np.ones(len(used))
-    rows = [judge_none(curves)] + [
-        judge(curves, name, count, weights, by_unit=by_unit) for name, count in CANDIDATES if model in ("auto", name)
-    ]
-    chosen = choose(curves, rows)
+    spread, rows, chosen = _judge_all(curves, model, by_unit)
+    if settling_time is None and (later := _settle_later(curves, chosen, made)):
+        curves = later
+        spread, rows, chosen = _judge_all(curves, model, by_unit)
     covariance = _covariance(curves, chosen, by_unit)
     table = chosen.table.with_rules(exit, taper_time, beyond, tolerance)
     record = make_record(
@@ -196,6 +200,39 @@ def fit_warmup(
         },
     )
     return WarmupFit(record, table, tuple(rows), spread, curves)
+
+
+def _judge_all(curves: Curves, model: str, by_unit: bool) -> tuple[CycleSpread, list[Judged], Judged]:
+    """Return the repeatability of curves, the models that are compared, and the one that is chosen."""
+    spread = repeatability(curves)
+    weights = cycle_weights(curves, spread) if by_unit else np.ones(len(curves.cycles))
+    rows = [judge_none(curves)] + [
+        judge(curves, name, count, weights, by_unit=by_unit) for name, count in CANDIDATES if model in ("auto", name)
+    ]
+    return spread, rows, choose(curves, rows)
+
+
+def _settle_later(curves: Curves, chosen: Judged, made: Callable[..., tuple[Curves, bool]]) -> Curves | None:
+    """Return the curves with the first later T_M after which no cycle drifts any more; None where there is no such one.
+
+    The drift must have slowed by half: one that goes on evenly is no warm-up, and only hides in a shorter part.
+    """
+    drifting, rate = still_drifting(curves, chosen), _drift_rates(curves)
+    time, last = curves.settling_time, _SETTLED_BY * float(curves.end.min())
+    kinds = [index for index in curves.kinds().values() if drifting[:, index].any()]  # of one unit each
+    while kinds and (time := 10 * np.ceil(_LATER * time / 10)) <= last:
+        later, _ = made(settling_time=float(time))
+        left = rate * _drift_rates(later)
+        slowed = all(left[:, index].sum() < _SLOWED * (rate[:, index] ** 2).sum() for index in kinds)
+        if slowed and not still_drifting(later, chosen).any():
+            return later
+    return None
+
+
+def _drift_rates(curves: Curves) -> Array:
+    """Return the mean rate at which settled parts drift at each temperature, shape (k, axes)."""
+    rate = curves.drift / (curves.end - curves.settling_time)[:, None]
+    return np.array([rate[curves.group == k].mean(axis=0) for k in np.unique(curves.group)])
 
 
 def _names(axes: str | Sequence[str]) -> tuple[str, ...]:

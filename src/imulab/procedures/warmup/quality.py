@@ -538,14 +538,19 @@ def _warn_motion(curves: Curves) -> list[str]:
     return [Finding(f"the unit moved; those seconds are left out: {_named(moved)}", action)] if moved else []
 
 
-def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
-    """Return messages on settled parts that still drift by much of the residual."""
+def still_drifting(curves: Curves, chosen: Judged) -> NDArray[np.bool_]:
+    """Return which settled parts still drift by much of the residual, shape (c, axes)."""
     clear = np.abs(curves.drift) > STILL_DRIFTS.limit * curves.drift_uncertainty
     largest = np.sqrt((curves.mean**2).mean(axis=(0, 1)))
-    big = np.abs(curves.drift) > np.maximum(_DRIFT_SHARE * chosen.training, 0.05 * largest)
+    return np.asarray(clear & (np.abs(curves.drift) > np.maximum(_DRIFT_SHARE * chosen.training, 0.05 * largest)))
+
+
+def _warn_drifts(curves: Curves, chosen: Judged) -> list[str]:
+    """Return messages on settled parts that still drift by much of the residual."""
+    drifting = still_drifting(curves, chosen)
     messages: list[str] = []
     for kind, index in curves.kinds().items():
-        share = (clear & big)[:, index]
+        share = drifting[:, index]
         if share.any():
             row, column = np.unravel_index(np.argmax(np.abs(curves.drift[:, index]) * share), share.shape)
             axis = index[column]
@@ -703,6 +708,11 @@ def _warn_intervals(curves: Curves, chosen: Judged) -> list[str]:
     ]
 
 
+def at_limit(curves: Curves, scale: float) -> bool:
+    """Return whether a time scale, s, is the longest that is sought, which tells only that it may be longer."""
+    return scale >= SCALE_LIMIT * curves.settling_time / _AT_LIMIT
+
+
 def _warn_constants(curves: Curves, chosen: Judged) -> list[str]:
     """Return a message on a time constant at the limit of the search, if its part of the curve matters."""
     if chosen.model != "exponential" or chosen.solution is None:
@@ -712,7 +722,7 @@ def _warn_constants(curves: Curves, chosen: Judged) -> list[str]:
     whole = np.nanmax(np.abs(curves.mean), axis=(0, 1))
     # An axis with one value has only rounding errors as its curve.
     counts = changes > np.maximum(_COUNTS * whole, _ROUNDING * np.abs(curves.reference).max(axis=0))
-    if tau < SCALE_LIMIT * curves.settling_time / _AT_LIMIT or not counts.any():
+    if not at_limit(curves, tau) or not counts.any():
         return []
     return [
         Finding(

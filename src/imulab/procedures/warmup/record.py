@@ -9,7 +9,15 @@ import numpy as np
 
 from imulab.procedures.warmup.cycles import Curves
 from imulab.procedures.warmup.model import WarmupTable, evaluate, exit_jump
-from imulab.procedures.warmup.quality import CycleSpread, Judged, Worst, after_of, expectations, quality_warnings
+from imulab.procedures.warmup.quality import (
+    CycleSpread,
+    Judged,
+    Worst,
+    after_of,
+    at_limit,
+    expectations,
+    quality_warnings,
+)
 from imulab.recording import Array
 from imulab.records.calibration import Calibration, Covariance, Parameter
 
@@ -90,10 +98,13 @@ def _parameters(
     if scales:
         single_scale = chosen.model == "knot-log-cubic"
         names = ("time_scale",) if single_scale else tuple(f"time_constant_{j + 1}" for j in range(len(scales)))
+        told = [j for j, value in enumerate(scales) if not at_limit(curves, value)]
         for j, (name, value) in enumerate(zip(names, scales, strict=True)):
-            parameters[name] = Parameter(value, None if known is None else float(np.sqrt(known[j, j])), "s")
-        if known is not None:
-            blocks.append((names, known))
+            parameters[name] = Parameter(
+                value, float(np.sqrt(known[j, j])) if known is not None and j in told else None, "s"
+            )
+        if known is not None and told:
+            blocks.append((tuple(names[j] for j in told), known[np.ix_(told, told)]))
     for i, (axis, unit) in enumerate(zip(curves.axes, curves.units, strict=True)):
         if spread.freedom:
             uncertainty = float(spread.uncertainty[i])
