@@ -257,7 +257,7 @@ def _describe_column(column: ColumnModel) -> list[str]:
         messages.append(kind(text, "let the unit rest undisturbed, and record again"))
     if change := loudness_change(_longest(analysis.stretches)):
         text = (
-            f"noise is {change.factor:.3g} times as loud from {change.time:.3g} s on; the model is a mean of both parts"
+            f"noise is {change.factor:.3g} times as loud from {change.time:.5g} s on; the model is a mean of both parts"
         )
         action = "fit both parts apart (--window), or record again at one temperature, fans and motors as in use"
         messages.append(Finding(text, action))
@@ -286,7 +286,7 @@ def _describe_warming(warming: WarmUp, column: ColumnModel, warm_from: float) ->
     """Return the sentence about a sensor that warms up, and what to leave out, all columns being warm from then on."""
     text = (
         f"drifts by {_sized(-warming.size, column.unit)} as while warming up, with a time constant of "
-        f"{warming.time:.3g} s; the model takes that for slow noise"
+        f"{warming.time:.4g} s; the model takes that for slow noise"
     )
     start = 10 * math.ceil(warm_from / 10)
     if start > column.analysis.length / 2:

@@ -98,13 +98,13 @@ def _parameters(
     if scales:
         single_scale = chosen.model == "knot-log-cubic"
         names = ("time_scale",) if single_scale else tuple(f"time_constant_{j + 1}" for j in range(len(scales)))
-        told = [j for j, value in enumerate(scales) if not at_limit(curves, value)]
+        determined = [j for j, value in enumerate(scales) if not at_limit(curves, value)]
         for j, (name, value) in enumerate(zip(names, scales, strict=True)):
             parameters[name] = Parameter(
-                value, float(np.sqrt(known[j, j])) if known is not None and j in told else None, "s"
+                value, float(np.sqrt(known[j, j])) if known is not None and j in determined else None, "s"
             )
-        if known is not None and told:
-            blocks.append((tuple(names[j] for j in told), known[np.ix_(told, told)]))
+        if known is not None and determined:
+            blocks.append((tuple(names[j] for j in determined), known[np.ix_(determined, determined)]))
     for i, (axis, unit) in enumerate(zip(curves.axes, curves.units, strict=True)):
         if spread.freedom:
             uncertainty = float(spread.uncertainty[i])
