@@ -48,7 +48,7 @@ def _knocked(recording):
     return _columns(recording, gyro_x=x)
 
 
-_FAULTS = ("stuck", "never changes", "exactly zero", "milliseconds", "unit moved", "differs from")
+_FAULTS = ("stuck", "never changes", "exactly zero", "unit of time", "unit moved", "differs from")
 
 
 def fitted(change, word: str, seed: int) -> Trial:
@@ -164,7 +164,7 @@ def _hot(recording):
 _STATED = "actual error at the worst temperature at most 1.4 times the stated one; rms error: actual over stated"
 SCENARIOS = [
     Scenario("Warm-up", "fit: nothing wrong", partial(fitted, None, ""), 12, None, false_alarms=5),
-    Scenario("Warm-up", "fit: ms titled as s", partial(fitted, _milliseconds, "milliseconds"), 8, None, warned=95),
+    Scenario("Warm-up", "fit: ms titled as s", partial(fitted, _milliseconds, "unit of time"), 8, None, warned=95),
     Scenario("Warm-up", "fit: a stuck gyro", partial(fitted, _stuck, "never changes"), 8, None, warned=95),
     Scenario("Warm-up", "fit: a knock of 2 s, 8 deg/s", partial(fitted, _knocked, "moved"), 8, None, warned=95),
     Scenario("Warm-up", "fit: every 50th row zero", partial(fitted, _zeros, "exactly zero"), 8, None, warned=95),
@@ -178,7 +178,7 @@ SCENARIOS = [
     ],
     Scenario("Warm-up", "fit: logs begun in time, thermometer", partial(begun, 0.0), 8, None, false_alarms=5),
     Scenario("Warm-up", "fit: all logs begun 10 s late, thermometer", partial(begun, 10.0), 8, None, warned=95),
-    _refused("apply: ms titled as s", _milliseconds, "milliseconds"),
+    _refused("apply: ms titled as s", _milliseconds, "unit of time"),
     _refused("apply: starts 20 s late", partial(_moved, 20.0), "after power-on"),
     _refused("apply: negative times", partial(_moved, -3.0), "before power-on"),
     _refused("apply: time runs backwards", _backwards, "row 201"),

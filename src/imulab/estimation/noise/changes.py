@@ -19,10 +19,10 @@ from imulab.recording import Array
 
 _FEW_STEPS, _WITHOUT_SLOW = 2, ("N", "NQ")
 """Most steps that are taken for what looks like slow noise; models that have no slow noise."""
-_STEP_GAIN, _BESIDE_SLOW = 22.0, 25.0
-"""What each step must gain where no slow noise is left: of 400 columns with a walk that hardly shows two gained more,
-those of 13 standard uncertainties 22 or more in all of 40. And where it is left: steps said of 60 logs with random walk
-gained 24 and 27, those of ten logs with a step of nine times the 1/f noise 26 to 43."""
+_STEP_GAIN, _BESIDE_SLOW = 20.0, 25.0
+"""What each step must gain where no slow noise is left: of 400 columns with a walk that hardly shows five gained more,
+of steps of 13 standard uncertainties all of 40, of 10 32 of 40. And where it is left: steps said of 60 logs with random
+walk gained 24 and 27, those of ten logs with a step of nine times the 1/f noise 26 to 43."""
 _SHORTEST, _LONGEST, _TIMES = 0.01, 0.25, 14
 """Shortest and longest time constant of a warm-up that is tried, in lengths of its stretch, and how many are tried."""
 _FEWEST_PARTS, _EITHER_SIDE, _LOUDER = 32, 5, 1.2
